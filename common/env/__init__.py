@@ -1,0 +1,1 @@
+"""The MuJoCo robot and the vectorised rally environment."""

@@ -1,0 +1,1 @@
+"""Ball physics: flight, bounces, and what the ball touches when. Pure numpy and numba."""

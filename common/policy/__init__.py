@@ -1,0 +1,1 @@
+"""The D2RL policy, its normalisers and how they are stored."""

@@ -1,0 +1,1 @@
+"""The rules of the task: states, touches, outcomes, launches, reward and layouts. Pure numpy and numba."""
