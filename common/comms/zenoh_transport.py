@@ -1,0 +1,315 @@
+"""The transport over Zenoh: the only file that imports it.
+
+The star: one hub (the learner's session, or a site's router) listens, everyone else is a client of it. What
+the code below works around, all of it measured:
+
+* a full Zenoh channel blocks one of two receiving threads of the process, so callbacks fill `Mailbox` rings,
+  which never block, and there are 8 threads;
+* a callback on a Python thread of its own keeps the process from exiting; a direct callback has none;
+* `zenoh.open` can't be interrupted, so it gets a short time-out, in a loop;
+* a session that was inherited by a fork discards everything in silence, so the process id is checked;
+* `close` waits for a hung hub, so it runs on a thread that may be left behind.
+"""
+
+import json
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+import zenoh
+from zenoh.handlers import Callback
+
+from common.comms.transport import (
+    MAX_ALIVE_EVENTS,
+    AliveEvent,
+    AliveWatch,
+    Bell,
+    Flow,
+    Mailbox,
+    NoReply,
+    PendingReply,
+    Reply,
+    Request,
+    Sample,
+    Server,
+    Subscription,
+    TransportError,
+    check_size,
+)
+from common.comms.zenoh_config import ZenohConfig, session_settings
+
+log = logging.getLogger(__name__)
+
+# Read by Zenoh when its first session is opened, not when it is imported.
+os.environ.setdefault(
+    "ZENOH_RUNTIME", "(rx: (worker_threads: 8), app: (worker_threads: 2), net: (worker_threads: 2))"
+)
+
+_OPEN_ATTEMPT_S: Final = 2.0
+_WAITING_LOG_S: Final = 10.0
+_MIB: Final = 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class _Service:
+    """How Zenoh treats one flow."""
+
+    priority: zenoh.Priority
+    congestion: zenoh.CongestionControl
+    express: bool = False
+
+
+# DROP wherever one hung receiver would stall the others; BLOCK only towards the one server of a request.
+_SERVICES: Final = {
+    Flow.POLICY: _Service(zenoh.Priority.DATA_HIGH, zenoh.CongestionControl.DROP),
+    Flow.STAGE: _Service(zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP, express=True),
+    Flow.ROLLOUT: _Service(zenoh.Priority.DATA, zenoh.CongestionControl.BLOCK),
+    Flow.RALLY: _Service(zenoh.Priority.DATA_LOW, zenoh.CongestionControl.DROP),
+    Flow.CONTROL: _Service(zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, express=True),
+    Flow.STATUS: _Service(zenoh.Priority.BACKGROUND, zenoh.CongestionControl.DROP),
+}
+
+
+def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "ZenohTransport":
+    """Return an open transport; a client waits for its hub, at most ``connect_timeout_s`` or until ``stop``.
+
+    Raises:
+        TransportError: The hub's port is taken, or no hub answered in time.
+    """
+    if config.mode == "hub":
+        try:
+            return ZenohTransport(zenoh.open(_zenoh_config(config, _OPEN_ATTEMPT_S)), config)
+        except zenoh.ZError as error:
+            raise TransportError(
+                f"can't listen at {config.endpoint}: {_reason(error)}; is another learner running there? "
+                "Stop it or choose another endpoint"
+            ) from error
+    started = time.monotonic()
+    next_log = started
+    while True:
+        now = time.monotonic()
+        left = started + config.connect_timeout_s - now
+        if left <= 0 or (stop is not None and stop.is_set()):
+            raise TransportError(
+                f"no hub answered at {config.endpoint} in {now - started:.0f} s: "
+                "start the learner (python -m services.learner) or correct the endpoint"
+            )
+        if now >= next_log:
+            log.info("waiting for the hub endpoint=%s waited_s=%.0f", config.endpoint, now - started)
+            next_log = now + _WAITING_LOG_S
+        try:
+            return ZenohTransport(zenoh.open(_zenoh_config(config, min(left, _OPEN_ATTEMPT_S))), config)
+        except zenoh.ZError as error:
+            log.debug("no hub yet endpoint=%s reason=%s", config.endpoint, _reason(error))
+
+
+def _zenoh_config(config: ZenohConfig, attempt_s: float) -> zenoh.Config:
+    settings = zenoh.Config()
+    for path, value in session_settings(config, attempt_s).items():
+        try:
+            settings.insert_json5(path, json.dumps(value))
+        except zenoh.ZError as error:
+            raise TransportError(f"Zenoh refuses {path} = {value!r}: {_reason(error)}") from error
+    return settings
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """Return the first line of Zenoh's message without the source position it ends in."""
+    return str(error).splitlines()[0].split(" at /")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _ZenohToken:
+    close: Callable[[], None]
+
+
+class ZenohTransport:
+    """One service's session; `Transport` says what its methods promise."""
+
+    def __init__(self, session: zenoh.Session, config: ZenohConfig) -> None:
+        self._session = session
+        self._config = config
+        self._process = os.getpid()
+        self._is_closed = False
+        self._bell = Bell()
+        self._publishers: dict[tuple[str, Flow], zenoh.Publisher] = {}
+        self._own_tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._links: dict[str, bool] = {}
+        self._times_up = 0
+        self._link_events: Mailbox[tuple[str, bool]] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
+        session.info.declare_transport_events_listener(
+            Callback(self._note_link, indirect=False), history=True
+        )
+
+    @property
+    def connected(self) -> bool:
+        """Whether the hub is reachable now; a hub always is."""
+        self._follow_links()
+        return not self._is_closed and (self._config.mode == "hub" or any(self._links.values()))
+
+    @property
+    def reconnect_count(self) -> int:
+        """How often the link to the hub came back; 0 for a hub."""
+        self._follow_links()
+        return 0 if self._config.mode == "hub" else max(0, self._times_up - 1)
+
+    def publish(self, key: str, payload: bytes, flow: Flow) -> None:
+        """Send to whoever subscribes now; never waits for a slow receiver, never tells about loss."""
+        check_size(key, payload, self._config.max_message_mib * _MIB)
+        with self._zenoh(f"publish on {key}"):
+            self._publisher(key, flow).put(payload)
+
+    def matching(self, key: str, flow: Flow) -> bool:
+        """Return whether somebody subscribes to ``key`` now."""
+        with self._zenoh(f"look for subscribers of {key}"):
+            # a MatchingStatus; Zenoh's type stub says bool
+            status: Any = self._publisher(key, flow).matching_status
+            return bool(status.matching)
+
+    def subscribe(self, key_expr: str, capacity: int) -> Subscription:
+        """Return a subscription that holds the newest ``capacity`` samples."""
+        inbox: Mailbox[zenoh.Sample] = Mailbox(self._bell, capacity, keep="newest")
+        with self._zenoh(f"subscribe to {key_expr}"):
+            subscriber = self._session.declare_subscriber(key_expr, Callback(inbox.put, indirect=False))
+        return Subscription(inbox, _read_sample, partial(self._undeclare, subscriber))
+
+    def serve(self, key_expr: str, capacity: int) -> Server:
+        """Return a server that holds up to ``capacity`` waiting requests."""
+        inbox: Mailbox[zenoh.Query] = Mailbox(self._bell, capacity, keep="oldest")
+
+        def take_in(query: zenoh.Query) -> None:
+            if not inbox.put(query):
+                _answer(query, None)
+
+        with self._zenoh(f"serve {key_expr}"):
+            queryable = self._session.declare_queryable(key_expr, Callback(take_in, indirect=False))
+        return Server(inbox, _read_query, partial(self._undeclare, queryable))
+
+    def request(self, key: str, payload: bytes, timeout_s: float, flow: Flow) -> PendingReply:
+        """Return a request on its way to one server of ``key``.
+
+        A hub that hangs can hold up the caller of a large request: at most 15 s, then the link is closed.
+        """
+        check_size(key, payload, self._config.max_message_mib * _MIB)
+        pending = PendingReply(self._bell, timeout_s)
+        service = _SERVICES[flow]
+        with self._zenoh(f"ask {key}"):
+            self._session.get(
+                key,
+                Callback(
+                    partial(_settle, pending), partial(pending.settle, NoReply.NO_SERVER), indirect=False
+                ),
+                target=zenoh.QueryTarget.BEST_MATCHING,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout_s,
+                congestion_control=service.congestion,
+                priority=service.priority,
+                express=service.express,
+                payload=payload,
+            )
+        return pending
+
+    def declare_alive(self, key: str) -> _ZenohToken:
+        """Return a token that others see while this transport lives."""
+        with self._zenoh(f"declare {key}"):
+            token = self._session.liveliness().declare_token(key)
+        self._own_tokens[key] = token  # a token that nobody holds is undeclared
+        return _ZenohToken(partial(self._undeclare, token))
+
+    def watch_alive(self, key_expr: str) -> AliveWatch:
+        """Return a watch on tokens; it starts with those that are there."""
+        inbox: Mailbox[AliveEvent] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
+
+        def take_in(sample: zenoh.Sample) -> None:
+            inbox.put(AliveEvent(key=str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT))
+
+        with self._zenoh(f"watch {key_expr}"):
+            watcher = self._session.liveliness().declare_subscriber(
+                key_expr, Callback(take_in, indirect=False), history=True
+            )
+        return AliveWatch(inbox, self._own_tokens.__contains__, partial(self._undeclare, watcher))
+
+    def wait(self, timeout_s: float) -> bool:
+        """Return whether anything arrived since the last call, at the latest after ``timeout_s``."""
+        return self._bell.wait(timeout_s)
+
+    def close(self, timeout_s: float = 5.0) -> bool:
+        """Return whether the session was closed within ``timeout_s``; what has been sent is flushed first."""
+        if self._is_closed or os.getpid() != self._process:
+            return True
+        self._is_closed = True
+        closer = threading.Thread(target=self._session.close, name="zenoh-close", daemon=True)
+        closer.start()
+        closer.join(timeout_s)
+        if closer.is_alive():
+            log.warning("gave up closing endpoint=%s after_s=%.1f", self._config.endpoint, timeout_s)
+        return not closer.is_alive()
+
+    def _publisher(self, key: str, flow: Flow) -> zenoh.Publisher:
+        if (key, flow) not in self._publishers:
+            service = _SERVICES[flow]
+            self._publishers[key, flow] = self._session.declare_publisher(
+                key,
+                congestion_control=service.congestion,
+                priority=service.priority,
+                express=service.express,
+            )
+        return self._publishers[key, flow]
+
+    def _undeclare(self, entity: Any) -> None:
+        if not self._is_closed:
+            with self._zenoh("undeclare"):
+                entity.undeclare()
+
+    @contextmanager
+    def _zenoh(self, action: str) -> Iterator[None]:
+        """Turn what Zenoh raises into one line, and refuse to work where it would fail in silence."""
+        if self._is_closed:
+            raise TransportError(f"can't {action}: this transport is closed")
+        if os.getpid() != self._process:
+            raise TransportError(
+                f"can't {action}: the session belongs to process {self._process} and does not survive "
+                "a fork; start processes with the spawn method and open a transport in each"
+            )
+        try:
+            yield
+        except zenoh.ZError as error:
+            raise TransportError(f"can't {action} at {self._config.endpoint}: {_reason(error)}") from error
+
+    def _note_link(self, event: zenoh.TransportEvent) -> None:
+        self._link_events.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
+
+    def _follow_links(self) -> None:
+        for peer, up in self._link_events.take_all():
+            self._times_up += up
+            self._links[peer] = up
+
+
+def _read_sample(sample: zenoh.Sample) -> Sample:
+    return Sample(key=str(sample.key_expr), payload=sample.payload.to_bytes())
+
+
+def _read_query(query: zenoh.Query) -> Request:
+    payload = b"" if query.payload is None else query.payload.to_bytes()
+    return Request(str(query.key_expr), payload, partial(_answer, query))
+
+
+def _answer(query: zenoh.Query, payload: bytes | None) -> None:
+    try:
+        if payload is not None:
+            query.reply(query.key_expr, payload)
+    except zenoh.ZError as error:
+        log.debug("the asker has gone key=%s reason=%s", query.key_expr, _reason(error))
+    finally:
+        query.drop()  # type: ignore[no-untyped-call]  # ends it, else the asker waits for its time-out
+
+
+def _settle(pending: PendingReply, reply: zenoh.Reply) -> None:
+    # The only error replies are Zenoh's own: its time-out.
+    pending.settle(NoReply.TIMEOUT if reply.ok is None else Reply(reply.ok.payload.to_bytes()))

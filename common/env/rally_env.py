@@ -1,0 +1,257 @@
+"""The vectorised rally environment: one call plays B robots and B balls for one control step."""
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.env.robot import RobotBatch, RobotPreset
+from common.jit import kernel
+from common.physics.constants import GRID_STEP
+from common.physics.flight import FULL, SIMPLE
+from common.rally import play
+from common.rally.draws import Stream, between, uniform
+from common.rally.noise import PROFILES, Condition, NoiseProfile
+from common.rally.observation import ACTION_SIZE, OBSERVATION_SIZE
+from common.rally.reward import RewardConfig, reward_table
+from common.rally.trajectory import Outcome, transition_table
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+Rows = npt.NDArray[np.int64]
+
+_GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
+
+
+class EnvConfig(BaseModel):
+    """The task: robot, rates, noise and reward."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    robot: RobotPreset = Field("rails", description="robot: ours, or the same slowed to the authors' limits")
+    control_rate_hz: Literal[50, 100, 200] = Field(
+        50, description="control steps a second", json_schema_extra={"unit": "Hz"}
+    )
+    noise: Literal["off", "standard", "hard"] = Field("standard", description="what differs from rally to rally")
+    flight: Literal["simple", "full"] = Field("simple", description="aerodynamics of the ball")
+    time_limit_s: float = Field(
+        2.5, gt=0.1, le=60, description="longest rally; cut, not lost", json_schema_extra={"unit": "s"}
+    )
+    carry_over: float = Field(
+        0.5, ge=0, le=1, description="share of episodes that begin as the last stroke left the robot"
+    )
+    go_on: float = Field(0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally")
+    rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
+    reset_spread: float = Field(
+        0.1, ge=0, le=0.5, description="joints start at home plus up to this", json_schema_extra={"unit": "m, rad"}
+    )
+    reward: RewardConfig = RewardConfig()
+
+
+class RallySource(Protocol):
+    """Where the environment gets its rallies."""
+
+    def take(self, count: int) -> "Launches":
+        """Return ``count`` launches; never blocks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Launches:
+    """Rallies to play, as generated."""
+
+    records: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
+    seeds: npt.NDArray[np.uint64]  # (n,)
+    validated: Flags  # (n,) False: a random launch that no generator flew; left out of all rates
+
+
+@dataclass(frozen=True, slots=True)
+class FinishedRallies:
+    """Rallies that ended in this step, one row each."""
+
+    rows: Rows  # (n,) which environment
+    seeds: npt.NDArray[np.uint64]  # (n,)
+    outcomes: npt.NDArray[np.uint8]  # (n,) trajectory.Outcome
+    landing_errors: Floats  # (n,) [m], nan where nothing landed
+    caught: Flags  # (n,)
+    over: Flags  # (n,)
+    validated: Flags  # (n,)
+    returns: Floats  # (n,) undiscounted reward of the rally
+    lengths: npt.NDArray[np.int32]  # (n,) control steps
+    conditions: Array  # (n, 14) noise.Condition
+
+
+@dataclass(frozen=True, slots=True)
+class EnvStep:
+    """What one control step brought. Environments that ended are reset already."""
+
+    obs: Floats  # (B, 37) of the next step: after a reset the new episode's first
+    reward: Floats  # (B,)
+    terminated: Flags  # (B,) the rally ended by its rules: the value of what follows is 0
+    truncated: Flags  # (B,) the time limit cut it: bootstrap from final_obs
+    ended: Rows  # (n,) rows with terminated or truncated
+    final_obs: Floats  # (n, 37) the last observation of each of ``ended``
+    terms: Array  # (B, 8) reward.TERMS
+    finished: FinishedRallies
+
+
+@kernel
+def _draw_robot(
+    seeds: npt.NDArray[np.uint64], noise: NoiseProfile, carry_over: float, spread: float, gains: Array, offset: Array
+) -> Flags:
+    """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds; return which robots stay as they are."""
+    stay = np.empty(seeds.shape[0], np.bool_)
+    low, high = noise.gain_factor
+    for k in range(seeds.shape[0]):
+        stay[k] = uniform(seeds[k], _RESET, 0) < carry_over
+        for j in range(7):
+            offset[k, j] = between(-spread, spread, seeds[k], _RESET, 2 + j)
+            for g in range(3):
+                gains[k, g, j] = between(low, high, seeds[k], _GAINS, 7 * g + j)
+    return stay
+
+
+class RallyEnv:
+    """B robots, each catching rallies from a source.
+
+    Args:
+        count: B.
+        config: The task.
+        source: Where rallies come from.
+        stage: Curriculum stage 1..3, the reward's column.
+        threads: MuJoCo threads.
+    """
+
+    def __init__(
+        self, count: int, config: EnvConfig, source: RallySource, stage: int = 1, threads: int = 1
+    ) -> None:
+        self.count = count
+        self.config = config
+        self.robot = RobotBatch(count, config.robot, config.control_rate_hz, threads=threads)
+        self.noise = PROFILES[config.noise]
+        self.home_action: Floats = self.robot.home_action.astype(np.float32)
+        self._source = source
+        self._rallies, self._step = play.allocate(count)
+        self._validated = np.zeros(count, np.bool_)
+        self._returns = np.zeros(count)
+        self._lengths = np.zeros(count, np.int32)
+        self._all = np.arange(count)
+        self._obs = np.zeros((count, OBSERVATION_SIZE), np.float32)
+        self._rewards = reward_table(config.reward)
+        self._started = False
+        self.set_stage(stage)
+
+    def set_stage(self, stage: int) -> None:
+        """Pay by another column of R from the next step on."""
+        if stage not in (1, 2, 3):
+            raise ValueError(f"stage {stage!r}: allowed are 1, 2, 3")
+        config = self.config
+        self.stage = stage
+        self._rules = play.Rules(
+            transitions=transition_table(),
+            rewards=np.ascontiguousarray(self._rewards[stage - 1]),
+            landing_scale=config.reward.landing_scale,
+            rate_scale=config.reward.reference_rate_hz / config.control_rate_hz,
+            torque_weight=config.reward.torque,
+            torque_limit=self.robot.torque_limit,
+            jitter_weight=config.reward.jitter,
+            collision_weight=config.reward.collision,
+            grid_steps=round(1.0 / (config.control_rate_hz * GRID_STEP)),
+            time_limit=config.time_limit_s,
+            flight_model=SIMPLE if config.flight == "simple" else FULL,
+        )
+
+    @property
+    def validated(self) -> Flags:
+        """Which environments play a rally that a generator validated (B,)."""
+        return self._validated.copy()
+
+    @property
+    def rallies(self) -> play.Rallies:
+        """The rallies in play, for rendering and tests: read, don't write."""
+        return self._rallies
+
+    def reset(self) -> Floats:
+        """Start every environment anew, robots at home; return the first observations (B, 37)."""
+        self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
+        self._rallies.last_action[:] = self.robot.home_action
+        self._begin(self._all, np.zeros(self.count, np.bool_))
+        self._started = True
+        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+        return self._obs.copy()
+
+    def step(self, actions: npt.ArrayLike) -> EnvStep:
+        """Play one control step with ``actions`` (B, 7); values beyond [-1, 1] are clipped."""
+        if not self._started:
+            raise RuntimeError("step() before reset(): call reset() first")
+        clipped = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        if clipped.shape != (self.count, ACTION_SIZE):
+            raise ValueError(f"actions of shape {clipped.shape}: allowed is {(self.count, ACTION_SIZE)}")
+        motion = self.robot.step(clipped)
+        play.play_step(self._rallies, motion, clipped, self._rules, self.noise, self._step)
+        self.robot.push_racket(self._step.impulse)
+        self._returns += self._step.reward
+        self._lengths += 1
+        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+
+        outcome = self._step.outcome
+        over = np.flatnonzero(outcome)
+        goes_on = (outcome[over] == Outcome.RETURNED) & (self._rallies.rounds_left[over] > 1)
+        ended = over[~goes_on]
+        truncated = outcome == Outcome.TIME_OUT
+        terminated = np.zeros(self.count, np.bool_)
+        terminated[ended] = True
+        terminated &= ~truncated
+        final_obs = self._obs[ended]
+        finished = self._finish(over)
+        if over.size:
+            self._begin(over, goes_on)
+            play.observe(self._rallies, over, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+        return EnvStep(
+            obs=self._obs.copy(),
+            reward=self._step.reward.astype(np.float32),
+            terminated=terminated,
+            truncated=truncated,
+            ended=ended,
+            final_obs=final_obs,
+            terms=self._step.terms,
+            finished=finished,
+        )
+
+    def _finish(self, rows: Rows) -> FinishedRallies:
+        r = self._rallies
+        return FinishedRallies(
+            rows=rows,
+            seeds=r.seed[rows],
+            outcomes=self._step.outcome[rows].astype(np.uint8),
+            landing_errors=r.landing_error[rows].astype(np.float32),
+            caught=r.caught[rows],
+            over=r.over[rows],
+            validated=self._validated[rows],
+            returns=self._returns[rows].astype(np.float32),
+            lengths=self._lengths[rows],
+            conditions=r.condition[rows],
+        )
+
+    def _begin(self, rows: Rows, same_episode: Flags) -> None:
+        """Launch the next rallies on ``rows``; where ``same_episode`` the robot goes on as it stands."""
+        launches = self._source.take(rows.size)
+        play.launch_rallies(self._rallies, rows, launches.records, launches.seeds, self.noise)
+        self._validated[rows] = launches.validated
+        self._returns[rows] = 0.0
+        self._lengths[rows] = 0
+        gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
+        config = self.config
+        stay = _draw_robot(launches.seeds, self.noise, config.carry_over, config.reset_spread, gains, offset)
+        self.robot.set_gains(rows, gains, self._rallies.condition[rows, Condition.ACTION_LATENCY])
+        # A fault must not outlive its episode: a robot that MuJoCo blew up goes home, whatever was drawn.
+        stay &= np.isfinite(self.robot.joint_vel[rows]).all(axis=1) & self._started
+        home = rows[~stay & ~same_episode]
+        if home.size:
+            self.robot.go_home(home, offset[~stay & ~same_episode])
+            self._rallies.last_action[home] = self.robot.home_action
+        longer = np.array([uniform(int(seed), _RESET, 1) < config.go_on for seed in launches.seeds], np.int64)
+        rounds = np.where(config.rounds > 1, config.rounds, 1 + longer)
+        self._rallies.rounds_left[rows] = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)

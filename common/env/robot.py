@@ -1,0 +1,132 @@
+"""B MuJoCo robots stepped together: targets in, joint records out, one Python call a control step."""
+
+from pathlib import Path
+from typing import Literal
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from mujoco.batch import Batch
+
+from common.rally.play import Motion
+
+Array = npt.NDArray[np.float64]
+RobotPreset = Literal["rails", "usst"]
+
+MODEL_PATH = Path(__file__).with_name("robot.xml")
+MUJOCO_STEP = 0.004  # [s] racket pose against 0.25 ms: tests/unit/env/test_robot.py states the error
+MUJOCO_STEP_200_HZ = 0.0025  # [s] two substeps where the control period is 5 ms
+JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
+RACKET_BODY = "racket"
+
+# Published limits of the group's robot: 2 m/s rails, 11.64 rad/s yaw and pitch, 5.86 rad/s the last three joints.
+USST_SPEED_LIMITS = (2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86)
+
+
+def load_model(preset: RobotPreset = "rails", step: float = MUJOCO_STEP) -> mujoco.MjModel:
+    """Return the compiled robot.
+
+    Args:
+        preset: ``rails`` (our robot) or ``usst`` (the same, slowed to the authors' published joint speeds:
+            damping is the speed limit, since MuJoCo has none).
+        step: MuJoCo's time step [s].
+    """
+    model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
+    model.opt.timestep = step
+    if preset == "usst":
+        for joint, limit in enumerate(USST_SPEED_LIMITS):
+            model.dof_damping[joint] = model.actuator_forcerange[joint, 1] / limit
+    return model
+
+
+class RobotBatch:
+    """B simulations of the robot on one thread.
+
+    Args:
+        count: B.
+        preset: See ``load_model``.
+        control_rate_hz: Control steps a second; its period must be a multiple of MuJoCo's step.
+        step: MuJoCo's time step [s]; None: the default for this control rate.
+        threads: MuJoCo threads; 1 keeps an actor on one core.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        preset: RobotPreset = "rails",
+        control_rate_hz: float = 50.0,
+        step: float | None = None,
+        threads: int = 1,
+    ) -> None:
+        period = 1.0 / control_rate_hz
+        if step is None:
+            step = MUJOCO_STEP if abs(period / MUJOCO_STEP - round(period / MUJOCO_STEP)) < 1e-9 else MUJOCO_STEP_200_HZ
+        self.substeps = round(period / step)
+        if abs(self.substeps * step - period) > 1e-9:
+            raise ValueError(f"control period {period} s is not a multiple of the MuJoCo step {step} s")
+        self.step_s = step
+        self.count = count
+        self.model = load_model(preset, step)
+        self.batch = Batch(self.model, count, threads)
+        self.joint_pos: Array = self.batch.bind("qpos")
+        self.joint_vel: Array = self.batch.bind("qvel")
+        self._ctrl: Array = self.batch.bind("ctrl")
+        self._wrench: Array = self.batch.bind("xfrc_applied")
+        self._racket = self.model.body(RACKET_BODY).id
+        limits = np.array(self.model.actuator_ctrlrange)
+        self.middle: Array = limits.mean(axis=1)
+        self.half_range: Array = limits[:, 1] - self.middle
+        self.torque_limit: Array = np.array(self.model.actuator_forcerange[:, 1])
+        self.home: Array = np.array(self.model.key("home").qpos)
+        self.home_action: Array = (self.home - self.middle) / self.half_range
+        # Gains and damping differ from rally to rally.
+        self._kp: Array = np.array(self.model.actuator_gainprm[:, 0])
+        self._kv: Array = -np.array(self.model.actuator_biasprm[:, 2])
+        self._damping_nominal: Array = np.array(self.model.dof_damping)
+        self._gain: Array = self.batch.expand("actuator_gainprm")
+        self._bias: Array = self.batch.expand("actuator_biasprm")
+        self._damping: Array = self.batch.expand("dof_damping")
+        self._held: Array = np.tile(self.home, (count, 1))
+        self._late_substeps = np.zeros(count, np.int64)
+        self._substep_index = np.arange(self.substeps)
+        self._control = np.empty((count, self.substeps, 7))
+        self._start = np.empty((count, 7))
+        self._records: dict[str, Array] = {}
+        self.go_home(np.arange(count), np.zeros((count, 7)))
+
+    def go_home(self, rows: npt.NDArray[np.int64], offset: Array) -> None:
+        """Put robots ``rows`` at rest at home plus ``offset`` (n, 7) [m, rad]."""
+        self.batch.reset(ids=rows, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        self.joint_pos[rows] = self.home + offset
+        self._held[rows] = self.home
+
+    def set_gains(self, rows: npt.NDArray[np.int64], factors: Array, action_latency: Array) -> None:
+        """Give robots ``rows`` their own drives: factors of kp, kv, damping (n, 3, 7) and latency [s] (n,)."""
+        kp = self._kp * factors[:, 0]
+        self._gain[rows, :, 0] = kp
+        self._bias[rows, :, 1] = -kp
+        self._bias[rows, :, 2] = -self._kv * factors[:, 1]
+        self._damping[rows] = self._damping_nominal * factors[:, 2]
+        self._late_substeps[rows] = np.rint(action_latency / self.step_s).astype(np.int64)
+
+    def push_racket(self, impulse: Array) -> None:
+        """Apply (B, 6) impulses [N s, N m s] about the racket's centre, spread over the next control step."""
+        self._wrench[:, self._racket] = impulse * (1.0 / (self.substeps * self.step_s))
+
+    def step(self, actions: Array) -> Motion:
+        """Return the motion of one control step under ``actions`` (B, 7) in [-1, 1]."""
+        target = self.middle + self.half_range * actions
+        self._start[:] = self.joint_pos
+        late = self._substep_index < self._late_substeps[:, None]
+        np.copyto(self._control, target[:, None, :])
+        np.copyto(self._control, self._held[:, None, :], where=late[:, :, None])
+        self._held = target
+        self._records = self.batch.rollout(
+            self.substeps,
+            control=self._control,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=("qpos", "actuator_force", "sensordata"),
+            out=self._records,
+        )
+        r = self._records
+        return Motion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)

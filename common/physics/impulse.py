@@ -1,0 +1,47 @@
+"""The impulse of a rigid ball on a surface: the law that table and racket share, in the surface's frame."""
+
+from common.jit import kernel
+from common.physics.constants import BALL_RADIUS, SPIN_PER_IMPULSE
+from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
+
+
+@kernel
+def slip(u: Vec, spin: Vec, normal: Vec) -> Vec:
+    """Return c = u - u_n n + r (n x w), the tangential velocity of the ball's contact point [m/s].
+
+    Args:
+        u: Velocity of the ball's centre relative to the surface [m/s].
+        spin: w [rad/s].
+        normal: Unit normal n of the surface, to the side the ball is on.
+    """
+    tangential = axpy(-dot(u, normal), normal, u)
+    return add(tangential, scale(BALL_RADIUS, cross(normal, spin)))
+
+
+@kernel
+def rebound(
+    u: Vec, spin: Vec, normal: Vec, restitution: float, alpha_max: float, friction: float
+) -> tuple[Vec, Vec]:
+    """Return the change of velocity and of spin by one contact (Nakashima, ACC 2010; Conti et al. 2026).
+
+    dv = -(1 + e_n) u_n n - alpha c and dw = (3 alpha/2r)(n x c). With J = m dv that is I dw = -r n x J_t:
+    linear and angular momentum hold by construction.
+
+    Args:
+        u: Velocity of the ball's centre relative to the surface, approaching: u_n = u.n < 0 [m/s].
+        spin: w [rad/s].
+        normal: Unit normal n of the surface, to the side the ball is on.
+        restitution: e_n [-].
+        alpha_max: alpha of a contact that sticks [-].
+        friction: mu [-]: where |J_t| would pass mu J_n the contact slides and alpha is smaller.
+    """
+    u_n = dot(u, normal)
+    c = slip(u, spin, normal)
+    c_norm = norm(c)
+    grip = friction * (1.0 + restitution) * -u_n
+    alpha = alpha_max
+    # written as a product: c = 0 and an infinite friction need no case of their own
+    if grip < alpha_max * c_norm:
+        alpha = grip / c_norm
+    dv = axpy(-(1.0 + restitution) * u_n, normal, scale(-alpha, c))
+    return dv, scale(SPIN_PER_IMPULSE * alpha, cross(normal, c))

@@ -1,0 +1,154 @@
+"""What the ball touches, and how far it is from it.
+
+Every obstacle is a *gap*: the distance [m] between the ball's surface and the obstacle's, negative inside, with
+the unit normal towards the ball. ``fly.py`` marches on these gaps by conservative advancement: a step of
+gap / (bound of the closing speed) can't pass through anything, however thin.
+"""
+
+import math
+from enum import IntEnum
+
+from common.jit import kernel
+from common.physics import arm
+from common.physics.arm import Joints, RacketPose
+from common.physics.constants import (
+    BALL_RADIUS,
+    FLOOR_Z,
+    NET_HALF_WIDTH,
+    NET_HEIGHT,
+    TABLE_HALF_LENGTH,
+    TABLE_HALF_WIDTH,
+    TABLE_THICKNESS,
+)
+from common.physics.vec import Vec, axpy, dot, norm, scale, sub
+
+
+class Touch(IntEnum):
+    """What a ball can touch."""
+
+    NONE = 0
+    ROBOT_COURT = 1
+    OPPONENT_COURT = 2
+    NET = 3
+    RACKET = 4
+    BODY = 5  # arm, handle, column or beam
+    EDGE = 6  # the table's edges and sides
+    FLOOR = 7
+    OUT = 8  # left the space any rally can come back from
+
+
+# Kernels take plain integers.
+NONE, ROBOT_COURT, OPPONENT_COURT, NET, RACKET, BODY, EDGE, FLOOR, OUT = (int(t) for t in Touch)
+
+NET_HALF_THICKNESS = 0.003  # [m] cord and mesh
+PLAY_X = 3.6  # [m] beyond these no touch can follow but the floor's
+PLAY_Y = 2.3  # [m]
+
+
+@kernel
+def _box_gap(pos: Vec, half_x: float, half_y: float, z_low: float, z_high: float) -> tuple[float, Vec]:
+    """Return gap and normal of a box centred on the z axis."""
+    nearest = (
+        min(max(pos[0], -half_x), half_x),
+        min(max(pos[1], -half_y), half_y),
+        min(max(pos[2], z_low), z_high),
+    )
+    offset = sub(pos, nearest)
+    distance = norm(offset)
+    if distance == 0.0:  # the centre itself is inside: no obstacle is entered that far from outside
+        return -BALL_RADIUS, (0.0, 0.0, 1.0)
+    return distance - BALL_RADIUS, scale(1.0 / distance, offset)
+
+
+@kernel
+def table_gap(pos: Vec) -> tuple[float, Vec]:
+    """Return gap and normal of the table, a box with its top at z = 0."""
+    return _box_gap(pos, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH, -TABLE_THICKNESS, 0.0)
+
+
+@kernel
+def net_gap(pos: Vec) -> tuple[float, Vec]:
+    """Return gap and normal of the net, a thin box that reaches 0.1525 m beyond the table's sides."""
+    return _box_gap(pos, NET_HALF_THICKNESS, NET_HALF_WIDTH, 0.0, NET_HEIGHT)
+
+
+@kernel
+def floor_gap(pos: Vec) -> tuple[float, Vec]:
+    """Return gap and normal of the floor."""
+    return pos[2] - FLOOR_Z - BALL_RADIUS, (0.0, 0.0, 1.0)
+
+
+@kernel
+def table_touch(pos: Vec) -> int:
+    """Return which part of the table a ball at gap zero touches: a court, or an edge."""
+    if abs(pos[0]) > TABLE_HALF_LENGTH or abs(pos[1]) > TABLE_HALF_WIDTH or pos[2] < 0.0:
+        return EDGE
+    return ROBOT_COURT if pos[0] <= 0.0 else OPPONENT_COURT
+
+
+@kernel
+def _capsule_gap(pos: Vec, start: Vec, end: Vec, radius: float) -> tuple[float, Vec]:
+    axis = sub(end, start)
+    along = dot(sub(pos, start), axis) / dot(axis, axis)
+    offset = sub(pos, axpy(min(max(along, 0.0), 1.0), axis, start))
+    distance = max(norm(offset), 1e-12)
+    return distance - radius - BALL_RADIUS, scale(1.0 / distance, offset)
+
+
+@kernel
+def racket_gap(pos: Vec, racket: RacketPose) -> tuple[float, Vec]:
+    """Return gap and normal of the racket: a flat disc thickened to a round rim.
+
+    On either face the normal is the face's; over the rim it turns outwards, so that an edge ball is deflected.
+    """
+    offset = sub(pos, racket.centre)
+    height = dot(offset, racket.normal)
+    radial = axpy(-height, racket.normal, offset)
+    radius = norm(radial)
+    beyond = radius - (arm.RACKET_RADIUS - arm.RACKET_HALF_THICKNESS)
+    if beyond <= 0.0:
+        normal = racket.normal if height >= 0.0 else scale(-1.0, racket.normal)
+        return abs(height) - arm.RACKET_HALF_THICKNESS - BALL_RADIUS, normal
+    distance = math.sqrt(height * height + beyond * beyond)
+    normal = axpy(height / distance, racket.normal, scale(beyond / (radius * distance), radial))
+    return distance - arm.RACKET_HALF_THICKNESS - BALL_RADIUS, normal
+
+
+@kernel
+def _rail_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
+    """Return gap and normal of what stands on the rails: beam and column."""
+    x = arm.RAIL_HOME_X + q[0]
+    beam, beam_normal = _capsule_gap(
+        pos, (x, -arm.BEAM_HALF_LENGTH, arm.BEAM_Z), (x, arm.BEAM_HALF_LENGTH, arm.BEAM_Z), arm.BEAM_RADIUS
+    )
+    column, column_normal = _capsule_gap(
+        pos, (x, q[1], arm.BEAM_Z), (x, q[1], arm.SHOULDER_Z), arm.COLUMN_RADIUS
+    )
+    if column < beam:
+        return column, column_normal
+    return beam, beam_normal
+
+
+@kernel
+def body_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
+    """Return gap and normal of the robot without its racket: beam, column, arm and handle."""
+    gap, normal = _rail_gap(pos, q)
+    p_shoulder, elbow, wrist, handle, _ = arm.links(q)
+    upper, upper_normal = _capsule_gap(pos, p_shoulder, elbow, arm.UPPER_ARM_RADIUS)
+    if upper < gap:
+        gap, normal = upper, upper_normal
+    fore, fore_normal = _capsule_gap(pos, elbow, wrist, arm.FOREARM_RADIUS)
+    if fore < gap:
+        gap, normal = fore, fore_normal
+    hand, hand_normal = _capsule_gap(pos, wrist, handle, arm.WRIST_RADIUS)
+    if hand < gap:
+        gap, normal = hand, hand_normal
+    return gap, normal
+
+
+@kernel
+def robot_gap_bound(pos: Vec, q: Joints) -> float:
+    """Return a distance [m] that no part of the robot is nearer than, without any trigonometry."""
+    rails, _ = _rail_gap(pos, q)
+    sphere = norm(sub(pos, arm.shoulder(q))) - arm.REACH - BALL_RADIUS
+    return min(rails, sphere)

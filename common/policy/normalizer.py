@@ -1,0 +1,52 @@
+"""Running mean and variance, merged exactly, and the frozen copy that normalises."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.float32]
+
+CLIP = 5.0  # normalised values are clipped to +-5 (rl_games, and the paper's weights)
+EPSILON = 1e-5  # added to the variance
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Mean and variance of everything seen so far."""
+
+    mean: Array  # (D,) or (): a value's moments are scalars
+    var: Array  # (D,) population variance
+    count: int
+
+    @staticmethod
+    def initial(size: int) -> "Moments":
+        """Return mean 0 and variance 1 with the weight of a single sample, which data soon outvote."""
+        return Moments(np.zeros(size), np.ones(size), 1)
+
+    @staticmethod
+    def of(data: npt.ArrayLike) -> "Moments":
+        """Return the moments of ``data`` (N, D)."""
+        values = np.asarray(data, np.float64)
+        return Moments(values.mean(axis=0), values.var(axis=0), len(values))
+
+    def merged(self, other: "Moments") -> "Moments":
+        """Return the moments of both data sets together (Chan, Golub, LeVeque 1983, eq. 1.5)."""
+        count = self.count + other.count
+        delta = other.mean - self.mean
+        mean = self.mean + delta * (other.count / count)
+        squares = self.var * self.count + other.var * other.count
+        squares = squares + delta * delta * (self.count * (other.count / count))
+        return Moments(mean, squares / count, count)
+
+    def recounted(self) -> "Moments":
+        """Return the same mean and variance with count 1: what a stage change does (the paper's algorithm 1)."""
+        return Moments(self.mean, self.var, 1)
+
+
+def normalize(data: Floats, moments: Moments) -> Floats:
+    """Return (data - mean) / sqrt(var + 1e-5), clipped to +-5, float32, for ``data`` (..., D)."""
+    scale = (1.0 / np.sqrt(moments.var + EPSILON)).astype(np.float32)
+    result = (data - moments.mean.astype(np.float32)) * scale
+    return np.clip(result, -CLIP, CLIP, out=result)

@@ -1,0 +1,331 @@
+"""Launches: what rallies start from, and blocks of those that are valid.
+
+A rally is valid if it crosses the net untouched and its first touch of anything is the robot's court.
+Everything random about a rally - launch, air, target, and at use table and rubber - is drawn from its own
+64-bit seed by counter (``draws.py``): no generator state to keep or to lose. So a block of valid rallies is a
+function of its arguments, and any launch can be drawn again from preset, noise profile and seed.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from common.jit import kernel
+from common.physics import touch
+from common.physics.flight import SIMPLE
+from common.physics.fly import fly_to_touch
+from common.physics.vec import Vec, cross
+from common.rally.draws import Stream, between, bits, normal_pair, uniform
+
+Array = npt.NDArray[np.float64]
+Seeds = npt.NDArray[np.uint64]
+
+# Layout of a launch row; the seed travels beside it, because a float64 can't hold it
+POSITION: Final = slice(0, 3)  # m
+VELOCITY: Final = slice(3, 6)  # m/s
+SPIN: Final = slice(6, 9)  # rad/s
+DRAG_FACTOR: Final = 9  # [-]
+LIFT_FACTOR: Final = 10  # [-]
+LAUNCH_SIZE: Final = 11
+
+LONGEST_FLIGHT: Final = 2.0  # s; no launch of any preset stays up that long
+FEWEST_VALID: Final = 1e-3  # [-] a preset with a smaller yield is a mistake, not a preset
+
+
+class Purpose(IntEnum):
+    """What a rally is for: the two top bits of its seed, so that no purpose can meet another's rallies."""
+
+    TRAINING = 0
+    EVALUATION = 1
+    FALLBACK = 2  # launches nobody validated, for an empty buffer
+
+
+# A distribution of one quantity: its quantiles at LEVELS, straight lines between, nothing beyond the ends
+Curve = tuple[float, float, float, float, float, float, float]
+LEVELS: Final[Curve] = (0.01, 0.05, 0.25, 0.50, 0.75, 0.95, 0.99)
+
+
+def flat(low: float, high: float) -> Curve:
+    """Return the curve of the uniform distribution: a straight line."""
+    a, b, c, d, e, f, g = (
+        low + (high - low) * (level - LEVELS[0]) / (LEVELS[-1] - LEVELS[0]) for level in LEVELS
+    )
+    return a, b, c, d, e, f, g
+
+
+class Preset(NamedTuple):
+    """How launches of one kind are drawn; world frame."""
+
+    position: tuple[Curve, Curve, Curve]  # m; x, y, z
+    # polar: speed [m/s], elevation [rad], azimuth [rad] from -x towards y; else v_x, v_y, v_z [m/s]
+    velocity: tuple[Curve, Curve, Curve]
+    polar: bool
+    # rad/s; topspin, sidespin (about z), corkscrew (about the heading); unused where spin_radius > 0
+    spin: tuple[Curve, Curve, Curve]
+    spin_radius: float  # rad/s; > 0: spin uniform in a ball of this radius
+    topspin_by_speed: float  # [-] correlation of topspin with speed (of their normal scores)
+
+
+_NO_SPIN_CURVES: Final = (flat(0.0, 0.0),) * 3
+_PAPER_POSITION: Final = (flat(0.025, 1.35), flat(-0.74, 0.74), flat(0.02, 0.84))
+_PAPER_VELOCITY: Final = (flat(-8.0, -3.0), flat(-4.0, 4.0), flat(-1.0, 1.0))
+
+PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
+    {
+        # the paper's box; its authors drew v_x only to -5 m/s and no spin
+        "paper": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _NO_SPIN_CURVES, 100.0, 0.0),
+        "strong": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _NO_SPIN_CURVES, 300.0, 0.0),
+        # 609 human shots of elite and professional matches that landed on the robot's side (recordings of
+        # Conti et al. 2026): their quantiles at LEVELS
+        "match": Preset(
+            position=(
+                # the last 3.43 is cut: a ball beyond 2.9 m counts as out of play
+                (0.45, 0.98, 1.32, 1.59, 1.97, 2.62, 2.80),
+                (-0.79, -0.64, -0.29, -0.04, 0.31, 0.65, 0.83),
+                (-0.09, 0.07, 0.17, 0.21, 0.26, 0.34, 0.47),
+            ),
+            velocity=(
+                (4.0, 5.2, 6.5, 10.2, 14.9, 19.5, 22.5),
+                (-0.070, 0.0, 0.087, 0.148, 0.227, 0.384, 0.524),
+                (-0.576, -0.401, -0.140, 0.035, 0.192, 0.367, 0.436),
+            ),
+            polar=True,
+            spin=(
+                (-325.0, -269.0, -105.0, 288.0, 481.0, 750.0, 820.0),
+                (-198.0, -122.0, -31.0, 25.0, 92.0, 220.0, 337.0),
+                (-133.0, -85.0, -25.0, 1.0, 26.0, 91.0, 176.0),
+            ),
+            spin_radius=0.0,
+            topspin_by_speed=0.75,
+        ),
+    }
+)
+
+
+class AirFactors(NamedTuple):
+    """Ranges of the two factors of the air in one noise profile, drawn per rally."""
+
+    drag: tuple[float, float]  # [-]
+    lift: tuple[float, float]  # [-]
+
+
+AIR_FACTORS: Final[Mapping[str, AirFactors]] = MappingProxyType(
+    {
+        "off": AirFactors((1.0, 1.0), (1.0, 1.0)),
+        "standard": AirFactors((0.85, 1.15), (0.80, 1.20)),
+        "hard": AirFactors((0.70, 1.30), (0.60, 1.40)),
+    }
+)
+
+TARGET_X: Final = (0.1, 1.35)  # m
+TARGET_Y: Final = (-0.7425, 0.7425)  # m; the court less the ball's radius
+
+
+@dataclass(frozen=True, slots=True)
+class RallyBlock:
+    """Rallies as they were drawn.
+
+    Attributes:
+        launches: (n, 11) float64: position, velocity, spin, drag factor, lift factor.
+        seeds: (n,) uint64: what the rest of each rally is drawn from.
+        drawn: How many candidates were drawn for these n.
+    """
+
+    launches: Array
+    seeds: Seeds
+    drawn: int
+
+
+@kernel
+def target(seed: int) -> tuple[float, float]:
+    """Return where on the opponent's court this rally's ball shall land: x, y [m]."""
+    return (
+        between(TARGET_X[0], TARGET_X[1], seed, Stream.TARGET, 0),
+        between(TARGET_Y[0], TARGET_Y[1], seed, Stream.TARGET, 1),
+    )
+
+
+@kernel
+def _quantile(curve: Curve, u: float) -> float:
+    """Return the curve's value at ``u`` in [0, 1): the ends beyond LEVELS are cut off."""
+    level = LEVELS[0] + (LEVELS[-1] - LEVELS[0]) * u
+    k = 1
+    while k < len(LEVELS) - 1 and level > LEVELS[k]:
+        k += 1
+    w = (level - LEVELS[k - 1]) / (LEVELS[k] - LEVELS[k - 1])
+    return curve[k - 1] + w * (curve[k] - curve[k - 1])
+
+
+@kernel
+def _drawn(curves: tuple[Curve, Curve, Curve], seed: int, counter: int) -> Vec:
+    """Return one independent value of each curve."""
+    return (
+        _quantile(curves[0], uniform(seed, Stream.LAUNCH, counter)),
+        _quantile(curves[1], uniform(seed, Stream.LAUNCH, counter + 1)),
+        _quantile(curves[2], uniform(seed, Stream.LAUNCH, counter + 2)),
+    )
+
+
+@kernel
+def _share_below(score: float) -> float:
+    """Return the standard normal distribution function."""
+    return 0.5 * math.erfc(-score / math.sqrt(2.0))
+
+
+@kernel
+def _ball_spin(radius: float, seed: int, counter: int) -> Vec:
+    """Return a spin uniform in a ball of ``radius``, never zero [rad/s]."""
+    up = between(-1.0, 1.0, seed, Stream.LAUNCH, counter)
+    azimuth = between(-math.pi, math.pi, seed, Stream.LAUNCH, counter + 1)
+    # 1 - u lies in (0, 1]
+    rate = radius * np.cbrt(1.0 - uniform(seed, Stream.LAUNCH, counter + 2))
+    across = rate * math.sqrt(1.0 - up * up)
+    return (across * math.cos(azimuth), across * math.sin(azimuth), rate * up)
+
+
+@kernel
+def _stroke(preset: Preset, seed: int) -> tuple[Vec, Vec]:
+    """Return velocity and spin of a polar preset; speed and topspin have correlated normal scores."""
+    score, other = normal_pair(seed, Stream.LAUNCH, 8)
+    correlation = preset.topspin_by_speed
+    topspin_score = correlation * score + math.sqrt(1.0 - correlation * correlation) * other
+    speed = _quantile(preset.velocity[0], _share_below(score))
+    topspin = _quantile(preset.spin[0], _share_below(topspin_score))
+    _, elevation, azimuth = _drawn(preset.velocity, seed, 3)
+    _, sidespin, corkscrew = _drawn(preset.spin, seed, 6)
+    heading = (-math.cos(azimuth), math.sin(azimuth), 0.0)
+    across = cross((0.0, 0.0, 1.0), heading)
+    flat_speed = speed * math.cos(elevation)
+    return (
+        (flat_speed * heading[0], flat_speed * heading[1], speed * math.sin(elevation)),
+        (
+            topspin * across[0] + corkscrew * heading[0],
+            topspin * across[1] + corkscrew * heading[1],
+            sidespin,
+        ),
+    )
+
+
+@kernel
+def launch(preset: Preset, air: AirFactors, seed: int) -> tuple[Vec, Vec, Vec, float, float]:
+    """Return position, velocity, spin, drag and lift factor of the launch with this seed, valid or not."""
+    position = _drawn(preset.position, seed, 0)
+    if preset.polar:
+        velocity, spin = _stroke(preset, seed)
+    else:
+        velocity = _drawn(preset.velocity, seed, 3)
+        spin = _ball_spin(preset.spin_radius, seed, 6)
+    drag_factor = between(air.drag[0], air.drag[1], seed, Stream.LAUNCH, 9)
+    lift_factor = between(air.lift[0], air.lift[1], seed, Stream.LAUNCH, 10)
+    return position, velocity, spin, drag_factor, lift_factor
+
+
+@kernel
+def is_valid(
+    position: Vec,
+    velocity: Vec,
+    spin: Vec,
+    drag_factor: float,
+    lift_factor: float,
+    model: int,
+    no_robot: Array,
+) -> bool:
+    """Return whether the ball starts free, crosses the net untouched and touches the robot's court first."""
+    if touch.table_gap(position)[0] <= 0.0 or touch.net_gap(position)[0] <= 0.0:
+        return False
+    _, _, _, what, _ = fly_to_touch(
+        position, velocity, spin, LONGEST_FLIGHT, drag_factor, lift_factor, model, no_robot
+    )
+    return what == touch.ROBOT_COURT
+
+
+@kernel
+def _fill(
+    preset: Preset,
+    air: AirFactors,
+    seed: int,
+    shard: int,
+    block: int,
+    purpose: int,
+    model: int,
+    valid_only: bool,
+    most: int,
+    launches: Array,
+    seeds: Seeds,
+) -> tuple[int, int]:
+    """Fill the arrays from their beginning; return how many rows are filled, by how many candidates."""
+    no_robot = np.empty((0, 14))
+    key = bits(seed, shard, block)
+    filled = 0
+    drawn = 0
+    while filled < len(seeds) and drawn < most:
+        seeds[filled] = (bits(key, purpose, drawn) >> np.uint64(2)) | (np.uint64(purpose) << np.uint64(62))
+        rally = seeds[filled]
+        drawn += 1
+        position, velocity, spin, drag_factor, lift_factor = launch(preset, air, rally)
+        if valid_only and not is_valid(position, velocity, spin, drag_factor, lift_factor, model, no_robot):
+            continue
+        for k in range(3):
+            launches[filled, k] = position[k]
+            launches[filled, 3 + k] = velocity[k]
+            launches[filled, 6 + k] = spin[k]
+        launches[filled, DRAG_FACTOR] = drag_factor
+        launches[filled, LIFT_FACTOR] = lift_factor
+        filled += 1
+    return filled, drawn
+
+
+def draw_rallies(
+    n: int,
+    *,
+    seed: int,
+    shard: int = 0,
+    block: int = 0,
+    preset: str = "paper",
+    noise: str = "standard",
+    purpose: Purpose = Purpose.TRAINING,
+    model: int = SIMPLE,
+) -> RallyBlock:
+    """Return a block of ``n`` valid rallies: the same arguments give the same bits in every process.
+
+    With ``Purpose.FALLBACK`` nothing is validated: the launches are the preset's as they come.
+
+    Args:
+        n: Rallies in the block.
+        seed: Of the run, 0 .. 2^64 - 1.
+        shard: Which of the run's streams of blocks.
+        block: Index in that stream. One seed's blocks share no rally.
+        preset: A key of ``PRESETS``.
+        noise: A key of ``AIR_FACTORS``: how far drag and lift are drawn from nominal. The launches behind two
+            profiles are the same up to what the air makes invalid.
+        purpose: Rallies of different purposes never share a seed.
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+    """
+    launches = np.empty((n, LAUNCH_SIZE))
+    seeds = np.empty(n, np.uint64)
+    most = math.ceil(n / FEWEST_VALID)
+    filled, drawn = _fill(
+        PRESETS[preset],
+        AIR_FACTORS[noise],
+        # a NumPy scalar: half of all seeds are too big for the int64 that numba makes of a Python int
+        np.array([seed], np.uint64)[0],
+        shard,
+        block,
+        int(purpose),
+        model,
+        purpose != Purpose.FALLBACK,
+        most,
+        launches,
+        seeds,
+    )
+    if filled < n:
+        raise ValueError(
+            f"launch preset {preset!r}: {filled} valid rallies in {drawn} candidates, wanted {n}"
+        )
+    return RallyBlock(launches, seeds, drawn)

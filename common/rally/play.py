@@ -1,0 +1,350 @@
+"""One control step of many rallies: flight, touches, states, reward and what the camera saw.
+
+Each ball is played by one readable function on its own row; the batch is a loop. Nothing here depends on the
+batch's size or order, so a batch equals its rallies played one by one, bit for bit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from common.jit import kernel
+from common.physics.arm import joint_rates_at, joints_at, point_velocity, racket_motion, racket_pose, racket_quaternion, speed_bound
+from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP
+from common.physics.fly import fly_step
+from common.physics.racket_bounce import racket_bounce
+from common.physics.table_bounce import table_bounce
+from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
+from common.physics.vec import axpy, cross, dot, norm, scale, sub
+from common.rally.draws import Stream, normal_pair, uniform
+from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
+from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
+
+Array = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+RING = MAX_LATENCY_STEPS + 1  # camera samples kept: one a grid step
+SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0..3
+CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
+MAX_SPEED_REWARDED = 10.0  # [m/s]
+FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
+_TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
+
+_TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
+_RETURNED, _TIME_OUT = int(Outcome.RETURNED), int(Outcome.TIME_OUT)
+_CAMERA = int(Stream.CAMERA)
+
+
+class Rallies(NamedTuple):
+    """The state of B rallies, one row each; the kernels write it in place."""
+
+    ball: Array  # (B, 9) position [m], velocity [m/s], spin [rad/s]
+    state: Integers  # (B,) State
+    seed: npt.NDArray[np.uint64]  # (B,)
+    condition: Array  # (B, 14) noise.Condition
+    clock: Integers  # (B,) grid steps since launch
+    rounds_left: Integers  # (B,) rallies left in this episode, the one in play included
+    caught: npt.NDArray[np.bool_]  # (B,) the racket touched the ball legally
+    over: npt.NDArray[np.bool_]  # (B,) and it crossed the net after that
+    landing_error: Array  # (B,) [m] planar distance to the target; nan before a legal landing
+    camera: Array  # (B, RING, 7) true samples on the grid, newest at ``head``
+    head: Integers  # (B,)
+    seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
+    last_action: Array  # (B, 7)
+
+
+class Motion(NamedTuple):
+    """What the robot did in one control step: MuJoCo's records of n substeps."""
+
+    start_pos: Array  # (B, 7) joint positions before the step
+    joint_pos: Array  # (B, n, 7)
+    torque: Array  # (B, n, 7) actuator forces [N, Nm]
+    contact: Array  # (B, n, bodies) touch sensors [N]
+    step: float  # [s] MuJoCo's time step
+
+
+class Rules(NamedTuple):
+    """Everything constant that a step needs."""
+
+    transitions: Integers  # trajectory.transition_table()
+    rewards: Array  # (8, 5) reward.reward_table()[stage - 1]
+    landing_scale: float  # [m]
+    rate_scale: float  # reference rate / control rate: continuous rows and e_r are rates
+    torque_weight: float
+    torque_limit: Array  # (7,) [N, Nm]
+    jitter_weight: float
+    collision_weight: float
+    grid_steps: int  # a control step
+    time_limit: float  # [s] a rally
+    flight_model: int
+
+
+class Step(NamedTuple):
+    """What one control step came to, one row a rally; the kernels write it in place."""
+
+    reward: Array  # (B,)
+    terms: Array  # (B, 8) reward.TERMS
+    outcome: Integers  # (B,) trajectory.Outcome
+    impulse: Array  # (B, 6) impulse [N s] and angular impulse [N m s] of the ball on the racket, about its centre
+
+
+def allocate(count: int) -> tuple[Rallies, Step]:
+    """Return zeroed rows for ``count`` rallies."""
+    rallies = Rallies(
+        ball=np.zeros((count, 9)),
+        state=np.zeros(count, np.int64),
+        seed=np.zeros(count, np.uint64),
+        condition=np.zeros((count, CONDITIONS)),
+        clock=np.zeros(count, np.int64),
+        rounds_left=np.ones(count, np.int64),
+        caught=np.zeros(count, np.bool_),
+        over=np.zeros(count, np.bool_),
+        landing_error=np.full(count, np.nan),
+        camera=np.zeros((count, RING, SAMPLE)),
+        head=np.zeros(count, np.int64),
+        seen=np.zeros((count, SAMPLE)),
+        last_action=np.zeros((count, 7)),
+    )
+    step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
+    return rallies, step
+
+
+@kernel
+def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
+    """Update what the robot sees of ball b: the sample of a latency ago with noise, or the last one if it is lost."""
+    seed = rallies.seed[b]
+    moment = rallies.clock[b] * GRID_STEP
+    condition = rallies.condition[b]
+    if step > 0 and (uniform(seed, _CAMERA, 8 * step) < noise.loss or condition[12] <= moment < condition[13]):
+        return
+    row = (rallies.head[b] + RING - int(condition[10])) % RING
+    seen = rallies.seen[b]
+    sample = rallies.camera[b, row]
+    if noise.position_noise == 0.0 and noise.velocity_noise == 0.0:
+        for k in range(6):
+            seen[k] = sample[k]
+    else:
+        a0, a1 = normal_pair(seed, _CAMERA, 4 * step + 1)
+        a2, a3 = normal_pair(seed, _CAMERA, 4 * step + 2)
+        a4, a5 = normal_pair(seed, _CAMERA, 4 * step + 3)
+        seen[0] = sample[0] + noise.position_noise * a0
+        seen[1] = sample[1] + noise.position_noise * a1
+        seen[2] = sample[2] + noise.position_noise * a2
+        seen[3] = sample[3] + noise.velocity_noise * a3
+        seen[4] = sample[4] + noise.velocity_noise * a4
+        seen[5] = sample[5] + noise.velocity_noise * a5
+    seen[6] = sample[6]
+
+
+@kernel
+def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: NoiseProfile) -> None:
+    """Put a rally on row b.
+
+    Args:
+        rallies: Rows to write.
+        b: Row.
+        record: Position, velocity, spin, drag factor, lift factor (11,), as generated.
+        seed: The rally's seed: conditions, target and camera noise follow from it.
+        noise: Profile to draw conditions from.
+    """
+    for k in range(9):
+        rallies.ball[b, k] = record[k]
+    rallies.state[b] = _TAU_0
+    rallies.seed[b] = seed
+    draw_conditions(seed, record[9], record[10], noise, rallies.condition[b])
+    rallies.clock[b] = 0
+    rallies.caught[b] = False
+    rallies.over[b] = False
+    rallies.landing_error[b] = np.nan
+    rallies.head[b] = 0
+    for row in range(RING):
+        for k in range(6):
+            rallies.camera[b, row, k] = record[k]
+        rallies.camera[b, row, 6] = 0.0
+    _look(rallies, b, 0, noise)
+
+
+@kernel
+def _play_one(
+    rallies: Rallies, b: int, motion: Motion, actions: Array, rules: Rules, noise: NoiseProfile, path: Array, step: Step
+) -> None:
+    """Play ball b for one control step. ``path`` (n + 1, 7) is scratch for the robot's joints."""
+    substeps = motion.joint_pos.shape[1]
+    for j in range(7):
+        path[0, j] = motion.start_pos[b, j]
+        for k in range(substeps):
+            path[k + 1, j] = motion.joint_pos[b, k, j]
+    fastest = speed_bound(path, motion.step)
+    ball, condition = rallies.ball[b], rallies.condition[b]
+    pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
+    target = (condition[8], condition[9], BALL_RADIUS)
+    state = rallies.state[b]
+    outcome = 0
+    paid_1, paid_2, paid_3 = False, False, False
+    racket_speed = 0.0
+    for k in range(6):
+        step.impulse[b, k] = 0.0
+
+    for grid_step in range(rules.grid_steps):
+        rest = GRID_STEP
+        for _ in range(_TOUCHES_A_STEP):
+            start = grid_step * GRID_STEP + (GRID_STEP - rest)
+            pos, vel, flown, what, normal = fly_step(
+                pos, vel, spin, rest, condition[0], condition[1], rules.flight_model, path, start, motion.step, fastest
+            )
+            rest -= flown
+            if (state == _TAU_2 or state == _TAU_23) and pos[0] > BALL_RADIUS:
+                rallies.over[b] = True
+            if what == NONE:
+                break
+            following = rules.transitions[state, what]
+            if what == ROBOT_COURT or what == OPPONENT_COURT:
+                vel, spin = table_bounce(vel, spin, normal, condition[2], condition[3])
+            elif what == RACKET:
+                moment = start + flown
+                joints = joints_at(path, moment, motion.step)
+                centre = racket_pose(joints).centre
+                racket_vel, racket_spin = racket_motion(joints, joint_rates_at(path, moment, motion.step))
+                contact = axpy(-BALL_RADIUS, normal, pos)
+                surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
+                if dot(sub(vel, surface_vel), normal) >= 0.0:
+                    continue  # a graze that is over as it begins: no contact without approach
+                before = vel
+                vel, spin = racket_bounce(
+                    vel, spin, normal, surface_vel, condition[4], condition[5], condition[6], condition[7], np.inf
+                )
+                impulse = scale(BALL_MASS, sub(before, vel))
+                turn = cross(sub(contact, centre), impulse)
+                for k in range(3):
+                    step.impulse[b, k] += impulse[k]
+                    step.impulse[b, 3 + k] += turn[k]
+                racket_speed = min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED)
+            if following >= OUTCOME_OFFSET:
+                outcome = following - OUTCOME_OFFSET
+                break
+            state = following
+            if state == _TAU_1:
+                paid_1 = True
+            elif state == _TAU_2:
+                paid_2 = True
+                rallies.caught[b] = True
+            elif state == _TAU_3:
+                paid_3 = True
+                rallies.over[b] = True
+                dx, dy = pos[0] - target[0], pos[1] - target[1]
+                rallies.landing_error[b] = np.sqrt(dx * dx + dy * dy)
+                if rallies.rounds_left[b] <= 1:
+                    outcome = _RETURNED
+                    break
+        rallies.clock[b] += 1
+        head = (rallies.head[b] + 1) % RING
+        rallies.head[b] = head
+        sample = rallies.camera[b, head]
+        for k in range(3):
+            sample[k], sample[3 + k] = pos[k], vel[k]
+        sample[6] = float(state // 2)
+        if outcome != 0:
+            break
+
+    # Reward: rows of the instants met in this step, or else the continuing state's row once.
+    joints = joints_at(path, substeps * motion.step, motion.step)
+    reach = norm(sub(pos, racket_pose(joints).centre))
+    near = norm(sub(pos, target))
+    g = 1.0 / ((1.0 + reach * reach) * (1.0 + reach * reach))
+    aim = 1.0 / ((1.0 + near * near) * (1.0 + near * near))
+    rows, terms = rules.rewards, step.terms[b]
+    for k in range(8):
+        terms[k] = 0.0
+    if paid_1:
+        terms[1] = rows[_TAU_1, 0]
+    if paid_2:
+        terms[2] = rows[_TAU_2, 0] + rows[_TAU_2, 2] * racket_speed
+    if paid_3:
+        miss = rallies.landing_error[b] / rules.landing_scale
+        terms[4] = rows[_TAU_3, 0] + rows[_TAU_3, 4] / ((1.0 + miss * miss) * (1.0 + miss * miss))
+    if not (paid_1 or paid_2 or paid_3 or state == _TAU_0):
+        terms[0] = rules.rate_scale * rows[state, 1] * g
+        terms[3] = rules.rate_scale * rows[state, 3] * aim
+    torque, jitter, collision = 0.0, 0.0, 0.0
+    for j in range(7):
+        change = actions[b, j] - rallies.last_action[b, j]
+        jitter += change * change
+        rallies.last_action[b, j] = actions[b, j]
+        for k in range(substeps):
+            torque += abs(motion.torque[b, k, j]) / rules.torque_limit[j]
+    for body in range(motion.contact.shape[2]):
+        for k in range(substeps):
+            collision += min(motion.contact[b, k, body] / CONTACT_FORCE_SCALE, 1.0)
+    terms[5] = -rules.torque_weight * rules.rate_scale * torque / substeps
+    terms[6] = -rules.jitter_weight * jitter
+    terms[7] = -rules.collision_weight * rules.rate_scale * collision / substeps
+    total = 0.0
+    for k in range(8):
+        total += terms[k]
+    step.reward[b] = total
+
+    if state % 2 == 0:  # an instant lasts for one control step
+        state += 1
+    if outcome == 0 and (rallies.clock[b] * GRID_STEP >= rules.time_limit - 1e-9 or not norm(pos) < FARTHEST):
+        outcome = _TIME_OUT
+    step.outcome[b] = outcome
+    rallies.state[b] = state
+    for k in range(3):
+        ball[k], ball[3 + k], ball[6 + k] = pos[k], vel[k], spin[k]
+    _look(rallies, b, rallies.clock[b] // rules.grid_steps, noise)
+
+
+@kernel
+def play_step(
+    rallies: Rallies, motion: Motion, actions: Array, rules: Rules, noise: NoiseProfile, step: Step
+) -> None:
+    """Play every rally for one control step; ``rallies`` and ``step`` are written in place."""
+    path = np.empty((motion.joint_pos.shape[1] + 1, 7))
+    for b in range(rallies.state.shape[0]):
+        _play_one(rallies, b, motion, actions, rules, noise, path, step)
+
+
+@kernel
+def launch_rallies(
+    rallies: Rallies, rows: Integers, records: Array, seeds: npt.NDArray[np.uint64], noise: NoiseProfile
+) -> None:
+    """Put rallies ``records`` (n, 11) with ``seeds`` (n,) on ``rows`` (n,)."""
+    for k in range(rows.shape[0]):
+        launch_rally(rallies, rows[k], records[k], seeds[k], noise)
+
+
+@kernel
+def observe(
+    rallies: Rallies, rows: Integers, joint_pos: Array, joint_vel: Array, out: npt.NDArray[np.float32]
+) -> None:
+    """Write the 37 numbers of ``observation.OBSERVATION`` for ``rows`` (n,) into the same rows of ``out`` (B, 37).
+
+    Args:
+        rallies: Rows to read.
+        rows: Which.
+        joint_pos: Joint positions now (B, 7).
+        joint_vel: Joint velocities now (B, 7).
+        out: Rows to write.
+    """
+    for k in range(rows.shape[0]):
+        b = rows[k]
+        o, q, qd = out[b], joint_pos[b], joint_vel[b]
+        joints = (q[0], q[1], q[2], q[3], q[4], q[5], q[6])
+        rates = (qd[0], qd[1], qd[2], qd[3], qd[4], qd[5], qd[6])
+        centre = racket_pose(joints).centre
+        velocity, _ = racket_motion(joints, rates)
+        quaternion = racket_quaternion(joints)
+        for j in range(7):
+            o[j], o[7 + j] = q[j], qd[j]
+        for j in range(3):
+            o[14 + j], o[21 + j] = centre[j], velocity[j]
+        for j in range(4):
+            o[17 + j] = quaternion[j]
+        for j in range(6):
+            o[24 + j] = rallies.seen[b, j]
+        o[30], o[31] = rallies.condition[b, 8], rallies.condition[b, 9]
+        s = int(rallies.seen[b, 6])
+        o[32] = 2.0 * s / 3.0 - 1.0
+        for j in range(4):
+            o[33 + j] = 1.0 if j == s else 0.0

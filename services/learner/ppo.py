@@ -1,0 +1,188 @@
+"""Decoupled PPO: the update, as functions of a dataset, a network and an optimiser.
+
+Hilton, Cobbe, Schulman 2022, "Batch size-invariance for policy optimization": data may come from a policy mu that
+is a version or two old, so the trust region is kept around pi_prox (the policy as this update finds it) and the
+importance weight to mu is clipped from above:
+
+    r = exp(log pi_theta - log pi_prox),  w = min(exp(log pi_prox - log mu), 2),  detached
+    L = -mean(w min(r A, clip(r, 1 - eps, 1 + eps) A))
+
+At lag 0 pi_prox = mu, w = 1: plain PPO.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
+from common.policy.normalizer import Moments
+
+MAX_WEIGHT = 2.0  # clip of pi_prox/mu
+KL_STEP = 1.5  # factor of one learning-rate adjustment
+
+
+class PPOConfig(BaseModel):
+    """Hyper-parameters of the update."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gamma: float = Field(0.99, gt=0, lt=1, description="discount per control step")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="trace decay of the advantage")
+    clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
+    mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
+    minibatch: int = Field(4096, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"})
+    reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
+    value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
+    entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
+    bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
+    gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
+    learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
+    learning_rate_min: float = Field(1e-4, gt=0, le=0.1, description="lower bound of the adaptation")
+    learning_rate_max: float = Field(1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage")
+    target_kl: float = Field(0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to")
+
+
+@dataclass(frozen=True, slots=True)
+class Dataset:
+    """One epoch's data, flattened, with everything that doesn't change during the update."""
+
+    obs: Tensor  # (N, D) normalised
+    actions: Tensor  # (N, A)
+    log_mu: Tensor  # (N,) as recorded by the actor
+    log_prox: Tensor  # (N,)
+    mean_prox: Tensor  # (N, A)
+    log_sigma_prox: Tensor  # (A,)
+    advantages: Tensor  # (N,) normalised
+    value_targets: Tensor  # (N,) normalised
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateStats:
+    """What an update came to."""
+
+    policy_loss: float
+    value_loss: float
+    bound_loss: float
+    entropy: float
+    kl: float  # KL(prox, new) after the update
+    clip_fraction: float
+    weight: float  # mean of pi_prox/mu before clipping: 1 at lag 0
+    gradient_norm: float  # before clipping
+    explained_variance: float
+    learning_rate: float
+    finite: bool  # False: a gradient step was skipped because it was not finite
+
+
+def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
+    """Return decoupled PPO's clipped surrogate loss (a scalar)."""
+    ratio = torch.exp(log_new - log_prox)
+    weight = torch.exp(log_prox - log_mu).clamp(max=MAX_WEIGHT).detach()
+    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
+    return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
+
+
+def bound_loss(mean: Tensor) -> Tensor:
+    """Return the mean squared excess of mean actions beyond +-1: targets that no joint can reach."""
+    return (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1).mean()
+
+
+def adapted_learning_rate(rate: float, kl: float, low: float, high: float, target: float) -> float:
+    """Return the learning rate after a look at the KL divergence of the last pass, within [low, high]."""
+    if kl > 2.0 * target:
+        rate /= KL_STEP
+    elif kl < 0.5 * target:
+        rate *= KL_STEP
+    return min(max(rate, low), high)
+
+
+def explained_variance(targets: npt.NDArray[np.float32], values: npt.NDArray[np.float32]) -> float:
+    """Return 1 - Var(target - value) / Var(target): 1 is perfect, 0 no better than the mean."""
+    variance = float(np.var(targets))
+    return 1.0 - float(np.var(targets - values)) / variance if variance > 0 else 0.0
+
+
+def denormalized(values: Tensor, moments: Moments) -> npt.NDArray[np.float32]:
+    """Return values in reward units (float32) from the critic's normalised ones."""
+    scale, mean = np.float32(np.sqrt(moments.var + 1e-5)), np.float32(moments.mean)
+    result: npt.NDArray[np.float32] = values.numpy() * scale + mean
+    return result
+
+
+def update(
+    network: ActorCritic,
+    optimizer: torch.optim.Optimizer,
+    data: Dataset,
+    config: PPOConfig,
+    learning_rate: float,
+    learning_rate_max: float,
+    generator: torch.Generator,
+    explained: float = 0.0,
+) -> UpdateStats:
+    """Run the mini-epochs of one epoch; ``network`` and ``optimizer`` are changed in place.
+
+    Args:
+        network: Policy and critic.
+        optimizer: Adam over its parameters.
+        data: This epoch's dataset.
+        config: Hyper-parameters.
+        learning_rate: To begin with; adapted after every pass.
+        learning_rate_max: This epoch's upper bound.
+        generator: Shuffles the minibatches.
+        explained: Explained variance of the values that the dataset was built with, passed through.
+    """
+    count = len(data.obs)
+    parameters = list(network.parameters())
+    sums = np.zeros(5)
+    steps, finite, kl = 0, True, 0.0
+    for _ in range(config.mini_epochs):
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate
+        kl_sum, batches = 0.0, 0
+        for rows in torch.randperm(count, generator=generator).split(config.minibatch):
+            if len(rows) < min(config.minibatch, count) // 2:
+                continue  # a small remainder would weigh as much as a full batch
+            mean, values = network(data.obs[rows])
+            log_new = log_prob(data.actions[rows], mean, network.log_sigma)
+            loss_policy = policy_loss(log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip)
+            loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
+            loss_bound = bound_loss(mean)
+            loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
+            if config.entropy_weight > 0:
+                loss = loss - config.entropy_weight * entropy(network.log_sigma)
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]  # torch ships it untyped
+            norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
+            if not np.isfinite(norm):
+                finite = False
+                continue
+            optimizer.step()
+            with torch.no_grad():
+                kl = float(
+                    kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma)
+                )
+                outside = ((log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
+            sums += (float(loss_policy), float(loss_value), float(loss_bound), float(outside.float().mean()), norm)
+            kl_sum += kl
+            steps, batches = steps + 1, batches + 1
+        kl = kl_sum / max(batches, 1)
+        learning_rate = adapted_learning_rate(
+            learning_rate, kl, config.learning_rate_min, learning_rate_max, config.target_kl
+        )
+    means = sums / max(steps, 1)
+    return UpdateStats(
+        policy_loss=float(means[0]),
+        value_loss=float(means[1]),
+        bound_loss=float(means[2]),
+        entropy=float(entropy(network.log_sigma.detach())),
+        kl=kl,
+        clip_fraction=float(means[3]),
+        weight=float((data.log_prox - data.log_mu).exp().mean()),
+        gradient_norm=float(means[4]),
+        explained_variance=explained,
+        learning_rate=learning_rate,
+        finite=finite,
+    )

@@ -1,0 +1,193 @@
+"""Launches: what a preset draws, which of it is valid, and that a block is a function of its arguments."""
+
+import numpy as np
+import pytest
+
+from common.physics import touch
+from common.physics.flight import SIMPLE
+from common.physics.fly import fly_to_touch
+from common.physics.vec import Vec
+from common.rally.launch import (
+    AIR_FACTORS,
+    DRAG_FACTOR,
+    LIFT_FACTOR,
+    POSITION,
+    PRESETS,
+    SPIN,
+    VELOCITY,
+    Array,
+    Purpose,
+    RallyBlock,
+    draw_rallies,
+    is_valid,
+    launch,
+    target,
+)
+
+NO_ROBOT = np.empty((0, 14))
+every_preset = pytest.mark.parametrize("preset", PRESETS)
+
+
+def fly(row: Array) -> tuple[Vec, Vec, float, int, Vec]:
+    position, velocity, spin = (tuple(map(float, row[part])) for part in (POSITION, VELOCITY, SPIN))
+    return fly_to_touch(position, velocity, spin, 2.0, row[DRAG_FACTOR], row[LIFT_FACTOR], SIMPLE, NO_ROBOT)
+
+
+def expect_same_bits(a: RallyBlock, b: RallyBlock) -> None:
+    assert a.launches.tobytes() == b.launches.tobytes()
+    assert a.seeds.tobytes() == b.seeds.tobytes()
+    assert a.drawn == b.drawn
+
+
+@every_preset
+def test_every_rally_crosses_the_net_and_touches_the_robots_court_first(preset):
+    block = draw_rallies(300, seed=1, preset=preset)
+    touches = [fly(row) for row in block.launches]
+
+    assert np.all(block.launches[:, 0] > 0.0)
+    assert {what for _, _, _, what, _ in touches} == {touch.ROBOT_COURT}
+    assert all(pos[0] < 0.0 and abs(pos[1]) <= 0.7625 for pos, *_ in touches)
+
+
+@every_preset
+@pytest.mark.parametrize("noise", AIR_FACTORS)
+def test_every_launch_lies_within_its_presets_ranges(preset, noise):
+    rows = draw_rallies(500, seed=2, preset=preset, noise=noise).launches
+    ranges = PRESETS[preset]
+    air = AIR_FACTORS[noise]
+
+    for column, curve in enumerate(ranges.position):
+        assert np.all((rows[:, column] >= min(curve)) & (rows[:, column] <= max(curve)))
+    assert np.all((rows[:, DRAG_FACTOR] >= air.drag[0]) & (rows[:, DRAG_FACTOR] <= air.drag[1]))
+    assert np.all((rows[:, LIFT_FACTOR] >= air.lift[0]) & (rows[:, LIFT_FACTOR] <= air.lift[1]))
+
+
+@pytest.mark.parametrize(("preset", "most"), [("paper", 100.0), ("strong", 300.0)])
+def test_the_papers_box_is_drawn_with_spin_uniform_in_a_ball(preset, most):
+    rows = draw_rallies(4000, seed=3, preset=preset, purpose=Purpose.FALLBACK).launches
+    spin_rate = np.linalg.norm(rows[:, SPIN], axis=1)
+
+    np.testing.assert_allclose(rows[:, VELOCITY].min(0), [-8.0, -4.0, -1.0], atol=0.02)
+    np.testing.assert_allclose(rows[:, VELOCITY].max(0), [-3.0, 4.0, 1.0], atol=0.02)
+    assert spin_rate.max() <= most
+    # P(|w| < q R) = q^3; 4,000 draws: three standard errors are 0.024
+    assert np.mean(spin_rate < 0.5 * most) == pytest.approx(0.125, abs=0.024)
+    np.testing.assert_allclose(rows[:, SPIN].mean(0), 0.0, atol=3 * most * np.sqrt(0.2 / 4000))
+
+
+@every_preset
+def test_no_ball_is_launched_without_spin(preset):
+    rows = draw_rallies(2000, seed=4, preset=preset, purpose=Purpose.FALLBACK).launches
+
+    assert np.linalg.norm(rows[:, SPIN], axis=1).min() > 0.1
+
+
+def test_the_match_presets_valid_rallies_are_shaped_like_recorded_human_shots():
+    """Median topspin per quartile of speed, and speed and spin at p5, p50, p95 of 609 shots."""
+    rows = draw_rallies(4000, seed=5, preset="match").launches
+    speed = np.linalg.norm(rows[:, VELOCITY], axis=1)
+    heading = rows[:, [3, 4]] / np.linalg.norm(rows[:, [3, 4]], axis=1, keepdims=True)
+    topspin = heading[:, 0] * rows[:, 7] - heading[:, 1] * rows[:, 6]
+    quartile = np.digitize(speed, [6.5, 10.2, 14.9])
+
+    np.testing.assert_allclose(
+        [np.median(topspin[quartile == k]) for k in range(4)], [-185, 176, 419, 577], atol=60
+    )
+    # drawn at random, fast shots miss more often than a player's: valid ones are somewhat slower
+    np.testing.assert_allclose(np.percentile(speed, [5, 50, 95]), [5.2, 10.2, 19.5], rtol=0.15)
+    np.testing.assert_allclose(np.percentile(topspin, [5, 50, 95]), [-269, 288, 750], atol=60)
+    assert np.corrcoef(speed, topspin)[0, 1] == pytest.approx(0.75, abs=0.05)
+
+
+def test_about_29_percent_of_the_papers_launches_are_valid():
+    assert 3000 / draw_rallies(3000, seed=6).drawn == pytest.approx(0.29, abs=0.03)
+
+
+@every_preset
+def test_a_block_is_a_function_of_its_arguments(preset):
+    arguments = dict(seed=2**64 - 1, shard=3, block=7, preset=preset, noise="hard")
+
+    expect_same_bits(draw_rallies(50, **arguments), draw_rallies(50, **arguments))
+
+
+@every_preset
+def test_a_longer_block_begins_with_the_shorter_one(preset):
+    short = draw_rallies(20, seed=8, preset=preset)
+    long = draw_rallies(50, seed=8, preset=preset)
+
+    assert long.launches[:20].tobytes() == short.launches.tobytes()
+    assert long.seeds[:20].tobytes() == short.seeds.tobytes()
+
+
+@every_preset
+def test_a_launch_is_drawn_again_from_its_seed_bit_for_bit(preset):
+    block = draw_rallies(50, seed=9, preset=preset)
+    for row, seed in zip(block.launches, block.seeds, strict=True):
+        position, velocity, spin, drag, lift = launch(PRESETS[preset], AIR_FACTORS["standard"], seed)
+
+        assert np.array([*position, *velocity, *spin, drag, lift]).tobytes() == row.tobytes()
+
+
+def test_a_rally_flies_again_bit_for_bit_from_its_stored_row():
+    rows = draw_rallies(50, seed=10, preset="match").launches
+    stored = np.frombuffer(rows.tobytes()).reshape(rows.shape)
+
+    assert [fly(row) for row in stored] == [fly(row) for row in rows]
+
+
+@pytest.mark.parametrize("other", [{"seed": 2}, {"shard": 1}, {"block": 1}], ids=str)
+def test_other_seeds_shards_and_blocks_share_no_rally(other):
+    one = draw_rallies(500, **{"seed": 1})
+    two = draw_rallies(500, **({"seed": 1} | other))
+
+    assert not set(one.seeds) & set(two.seeds)
+
+
+def test_training_evaluation_and_fallback_can_share_no_rally():
+    """Not by luck: each purpose has its own values of the seed's two top bits."""
+    top_bits = {
+        purpose: set((draw_rallies(200, seed=1, purpose=purpose).seeds >> np.uint64(62)).tolist())
+        for purpose in Purpose
+    }
+
+    assert top_bits == {purpose: {int(purpose)} for purpose in Purpose}
+
+
+def test_without_noise_the_air_is_nominal():
+    rows = draw_rallies(20, seed=11, noise="off").launches
+
+    assert np.all(rows[:, [DRAG_FACTOR, LIFT_FACTOR]] == 1.0)
+
+
+def test_targets_cover_the_opponents_court_inside_its_lines():
+    seeds = draw_rallies(4000, seed=12, purpose=Purpose.FALLBACK).seeds
+    x, y = np.array([target(seed) for seed in seeds]).T
+
+    assert x.min() >= 0.1
+    assert x.max() <= 1.35
+    assert np.abs(y).max() <= 0.7425
+    np.testing.assert_allclose([x.mean(), y.mean()], [0.725, 0.0], atol=0.025)
+    assert np.corrcoef(x, y)[0, 1] == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_ball_that_starts_inside_the_net_is_not_valid():
+    inside = (0.01, 0.0, 0.1)
+
+    assert not is_valid(inside, (-6.0, 0.0, 2.0), (1.0, 0.0, 0.0), 1.0, 1.0, SIMPLE, NO_ROBOT)
+
+
+def test_a_net_cord_ball_is_not_valid():
+    over, cord = ((0.5, 0.0, z) for z in (0.28, 0.20))
+
+    assert is_valid(over, (-6.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1.0, 1.0, SIMPLE, NO_ROBOT)
+    assert not is_valid(cord, (-6.0, 0.0, 0.0), (1.0, 0.0, 0.0), 1.0, 1.0, SIMPLE, NO_ROBOT)
+
+
+def test_a_preset_whose_launches_are_never_valid_is_an_error_not_an_endless_loop(monkeypatch):
+    short = PRESETS["paper"]._replace(velocity=((-0.1,) * 7, (0.0,) * 7, (0.0,) * 7))
+    monkeypatch.setattr("common.rally.launch.PRESETS", {"short": short})
+
+    with pytest.raises(
+        ValueError, match="launch preset 'short': 0 valid rallies in 2000 candidates, wanted 2"
+    ):
+        draw_rallies(2, seed=1, preset="short")
