@@ -12,7 +12,8 @@ from dataclasses import asdict, dataclass
 
 from common.comms.codec import decode, encode
 from common.comms.messages import RallyBatch
-from common.rally.launch import AIR_FACTORS, PRESETS, draw_rallies
+from common.rally.launch import draw_rallies
+from common.rally.launch_presets import AIR_FACTORS, PRESETS
 
 
 @dataclass(frozen=True, slots=True)

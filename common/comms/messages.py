@@ -169,18 +169,6 @@ class Rollout:
         return ""
 
 
-@dataclass(frozen=True, slots=True)
-class CreditRequest:
-    """An actor that may not send anything asks whether it may now; the reply is a `Verdict`."""
-
-    VERSION: ClassVar[int] = 1
-
-    run: str
-    actor: str
-    incarnation: Count
-    version: Count  # of the policy it holds
-
-
 class VerdictKind(StrEnum):
     """What became of a rollout."""
 
@@ -191,11 +179,10 @@ class VerdictKind(StrEnum):
     WRONG_GENERATION = "wrong_generation"
     STALE_STAGE = "stale_stage"
     TOO_OLD = "too_old"
-    EXPIRED = "expired"  # numbered below what the learner remembers
     DUPLICATE = "duplicate"  # seen before; ``first`` holds the verdict of then
     BUSY = "busy"
     UNREADABLE = "unreadable"  # so broken that nobody can say whose it was
-    CREDITS = "credits"  # the answer to a CreditRequest
+    CREDITS = "credits"  # the answer to an ActorReport
 
 
 # Each sequence number gets exactly one of these; after any other kind the actor sends it again.
@@ -208,14 +195,13 @@ FINAL_VERDICTS = frozenset(
         VerdictKind.WRONG_GENERATION,
         VerdictKind.STALE_STAGE,
         VerdictKind.TOO_OLD,
-        VerdictKind.EXPIRED,
     }
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The learner's answer to a rollout or a credit request, and where it stands itself."""
+    """The learner's answer to a rollout or a report, and where it stands itself."""
 
     VERSION: ClassVar[int] = 1
 
@@ -226,8 +212,42 @@ class Verdict:
     version: Count
     stage_number: Count
     stage: Stage
-    credits: Count  # rollouts that the learner wants from this actor now ...
-    credits_version: Count  # ... played by this version or a later one
+    # The pacing. An absolute limit, so that a lost or repeated answer changes nothing.
+    credit_limit: Count  # the actor may publish sequence numbers below this ...
+    credit_version: Count  # ... played by this version or a later one
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A rollout that got a final verdict other than accepted."""
+
+    VERSION: ClassVar[int] = 1
+
+    sequence: Count
+    kind: VerdictKind
+    generation: Count  # of the learner that said so
+
+
+@dataclass(frozen=True, slots=True)
+class ActorReport:
+    """What became of an actor's rollouts as far as it knows; the reply is a `Verdict` with fresh credits.
+
+    What is below ``published`` and not listed was accepted, or refused by the learner of ``generation``,
+    who knows that itself.
+    """
+
+    VERSION: ClassVar[int] = 1
+
+    run: str
+    actor: str
+    incarnation: Count
+    version: Count  # of the policy that it holds
+    published: Count  # sequence numbers used so far
+    in_flight: tuple[int, ...]
+    dropped: tuple[int, ...]  # given up
+    generation: Count  # of the learner that the actor heard last; 0 is none
+    refused: tuple[Refusal, ...]  # by learners of other generations
+    leaving: bool  # nothing will follow
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,8 +314,8 @@ MESSAGES: tuple[type[Any], ...] = (
     StageChange,
     StageLog,
     Rollout,
-    CreditRequest,
     Verdict,
+    ActorReport,
     Status,
     Bye,
     Control,

@@ -39,6 +39,15 @@ def load_model(preset: RobotPreset = "rails", step: float = MUJOCO_STEP) -> mujo
     return model
 
 
+def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
+    """Return the action (7,) that holds the home pose."""
+    model = load_model(preset)
+    limits = np.array(model.actuator_ctrlrange)
+    middle = limits.mean(axis=1)
+    action: npt.NDArray[np.float32] = ((model.key("home").qpos - middle) / (limits[:, 1] - middle)).astype(np.float32)
+    return action
+
+
 class RobotBatch:
     """B simulations of the robot on one thread.
 

@@ -23,10 +23,8 @@ BALL_MASS: Final = 2.7e-3  # kg; ITTF
 BALL_INERTIA: Final = 2.0 / 3.0 * BALL_MASS * BALL_RADIUS**2  # kg m^2; thin shell
 BALL_AREA: Final = math.pi * BALL_RADIUS**2  # m^2; cross section
 BALL_VOLUME: Final = 4.0 / 3.0 * math.pi * BALL_RADIUS**3  # m^3
-ROLLING_ALPHA: Final = (
-    2.0 / 5.0
-)  # [-] 1/(1 + m r^2/I): share of the slip whose removal leaves a shell rolling
-SPIN_PER_IMPULSE: Final = 3.0 / (2.0 * BALL_RADIUS)  # 1/m; m r/I: change of spin per change of velocity
+ROLLING_ALPHA: Final = 2.0 / 5.0  # [-] 1/(1 + m r^2/I): this share of the slip taken, a shell rolls
+SPIN_PER_VELOCITY: Final = 3.0 / (2.0 * BALL_RADIUS)  # 1/m; m r/I: change of spin per change of velocity
 
 # Air and gravity
 GRAVITY: Final = 9.81  # m/s^2

@@ -24,9 +24,10 @@ from common.physics.constants import (
     NET_HEIGHT,
     TABLE_HALF_LENGTH,
     TABLE_HALF_WIDTH,
+    TABLE_THICKNESS,
 )
 from common.physics.flight import flight_step
-from common.physics.touch import BODY, FLOOR, NET, NONE, OUT, RACKET
+from common.physics.touch import BODY, FLOOR, NET, NET_HALF_THICKNESS, NONE, OUT, RACKET
 from common.physics.vec import Vec, norm
 
 NO_ROBOT: Array = np.zeros((0, 7))  # the trajectory of a robot that is not there
@@ -136,7 +137,7 @@ def _still_touch(p0: Vec, v0: Vec, p1: Vec, v1: Vec, h: float, unused: Array) ->
         low < BALL_RADIUS
         and abs(p0[0]) < TABLE_HALF_LENGTH + way
         and abs(p0[1]) < TABLE_HALF_WIDTH + way
-        and max(p0[2], p1[2]) > -way
+        and max(p0[2], p1[2]) > -way - TABLE_THICKNESS
     ):
         # Over the table the gap is the height: it closes no faster than the ball falls.
         over = (
@@ -147,7 +148,7 @@ def _still_touch(p0: Vec, v0: Vec, p1: Vec, v1: Vec, h: float, unused: Array) ->
         t = _march(_TABLE, p0, v0, p1, v1, h, first, falling if over else speed, unused, 0.0, 1.0)
         if t >= 0.0:
             first, what = t, _TABLE
-    if abs(p0[0]) < way and low < NET_HEIGHT + BALL_RADIUS and abs(p0[1]) < NET_HALF_WIDTH + way:
+    if abs(p0[0]) < way + NET_HALF_THICKNESS and low < NET_HEIGHT + BALL_RADIUS and abs(p0[1]) < NET_HALF_WIDTH + way:
         t = _march(_NET, p0, v0, p1, v1, h, first, speed, unused, 0.0, 1.0)
         if t >= 0.0:
             first, what = t, _NET

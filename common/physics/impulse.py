@@ -1,7 +1,7 @@
 """The impulse of a rigid ball on a surface: the law that table and racket share, in the surface's frame."""
 
 from common.jit import kernel
-from common.physics.constants import BALL_RADIUS, SPIN_PER_IMPULSE
+from common.physics.constants import BALL_RADIUS, SPIN_PER_VELOCITY
 from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
 
 
@@ -44,4 +44,4 @@ def rebound(
     if grip < alpha_max * c_norm:
         alpha = grip / c_norm
     dv = axpy(-(1.0 + restitution) * u_n, normal, scale(-alpha, c))
-    return dv, scale(SPIN_PER_IMPULSE * alpha, cross(normal, c))
+    return dv, scale(SPIN_PER_VELOCITY * alpha, cross(normal, c))

@@ -10,6 +10,7 @@ importance weight to mu is clipped from above:
 At lag 0 pi_prox = mu, w = 1: plain PPO.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +45,9 @@ class PPOConfig(BaseModel):
     learning_rate_min: float = Field(1e-4, gt=0, le=0.1, description="lower bound of the adaptation")
     learning_rate_max: float = Field(1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage")
     target_kl: float = Field(0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to")
+    refit_epochs: int = Field(
+        8, ge=0, le=1000, description="epochs after a stage change in which only the critic learns, the policy held"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,8 @@ def update(
     learning_rate_max: float,
     generator: torch.Generator,
     explained: float = 0.0,
+    breathe: Callable[[], None] = lambda: None,
+    hold_policy: bool = False,
 ) -> UpdateStats:
     """Run the mini-epochs of one epoch; ``network`` and ``optimizer`` are changed in place.
 
@@ -133,6 +139,10 @@ def update(
         learning_rate_max: This epoch's upper bound.
         generator: Shuffles the minibatches.
         explained: Explained variance of the values that the dataset was built with, passed through.
+        breathe: Called between gradient steps.
+        hold_policy: Learn the critic alone: KL(prox, new) takes the surrogate's place and keeps the policy where it
+            is while the shared trunk moves. For the first epochs of a stage, whose rewards the critic doesn't know
+            yet: by the old ones it would punish the very contact that leads on to them.
     """
     count = len(data.obs)
     parameters = list(network.parameters())
@@ -147,7 +157,12 @@ def update(
                 continue  # a small remainder would weigh as much as a full batch
             mean, values = network(data.obs[rows])
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
-            loss_policy = policy_loss(log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip)
+            if hold_policy:
+                loss_policy = kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma)
+            else:
+                loss_policy = policy_loss(
+                    log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
+                )
             loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
             loss_bound = bound_loss(mean)
             loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
@@ -165,13 +180,15 @@ def update(
                     kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma)
                 )
                 outside = ((log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
-            sums += (float(loss_policy), float(loss_value), float(loss_bound), float(outside.float().mean()), norm)
+            sums += (loss_policy.item(), loss_value.item(), loss_bound.item(), outside.float().mean().item(), norm)
+            breathe()
             kl_sum += kl
             steps, batches = steps + 1, batches + 1
         kl = kl_sum / max(batches, 1)
-        learning_rate = adapted_learning_rate(
-            learning_rate, kl, config.learning_rate_min, learning_rate_max, config.target_kl
-        )
+        if not hold_policy:
+            learning_rate = adapted_learning_rate(
+                learning_rate, kl, config.learning_rate_min, learning_rate_max, config.target_kl
+            )
     means = sums / max(steps, 1)
     return UpdateStats(
         policy_loss=float(means[0]),

@@ -112,8 +112,11 @@ def test_a_rollout_without_episodes_or_truncations_is_fine():
         (sealed(msgpack.packb(["Verdict", True, {}])), "version True"),
         (sealed(msgpack.packb(["Verdict", 1, {"kind": "busy", "spam": 1}])), "missing.*first.*unknown.*spam"),
         (with_field(make_verdict(), "kind", "maybe"), "Verdict.kind: 'maybe'; allowed: accepted, "),
-        (with_field(make_verdict(), "credits", "2"), "Verdict.credits: '2' of type str; allowed: int"),
-        (with_field(make_verdict(), "credits", -1), "Verdict.credits: -1; allowed: 0 to"),
+        (
+            with_field(make_verdict(), "credit_limit", "2"),
+            "credit_limit: '2' of type str; allowed: int",
+        ),
+        (with_field(make_verdict(), "credit_limit", -1), "Verdict.credit_limit: -1; allowed: 0 to"),
         (with_field(make_verdict(), "stage", 4), "Verdict.stage: 4; allowed: 1 to 3"),
         (with_field(make_verdict(), "reason", msgpack.ExtType(1, b"x")), "extension type 1"),
     ],
@@ -195,7 +198,7 @@ def test_who_sent_a_bad_rollout_can_still_be_told():
         (make_rollout(rewards=np.zeros((2, 2), "<f4")), "Rollout.rewards: shape .*T = 3 as in Rollout.obs"),
         (make_verdict(reason=3), "Verdict.reason: int; allowed: str"),
         (make_verdict(kind="accepted"), "Verdict.kind: str; allowed: VerdictKind"),
-        (make_verdict(credits=2**70), "Verdict"),
+        (make_verdict(credit_limit=2**70), "Verdict"),
     ],
 )
 def test_a_message_that_breaks_its_own_declaration_is_not_sent(message, error):

@@ -5,14 +5,12 @@ import pytest
 
 from common.physics import touch
 from common.physics.flight import SIMPLE
-from common.physics.fly import fly_to_touch
+from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.vec import Vec
 from common.rally.launch import (
-    AIR_FACTORS,
     DRAG_FACTOR,
     LIFT_FACTOR,
     POSITION,
-    PRESETS,
     SPIN,
     VELOCITY,
     Array,
@@ -23,8 +21,8 @@ from common.rally.launch import (
     launch,
     target,
 )
+from common.rally.launch_presets import AIR_FACTORS, PRESETS
 
-NO_ROBOT = np.empty((0, 14))
 every_preset = pytest.mark.parametrize("preset", PRESETS)
 
 

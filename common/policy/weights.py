@@ -1,0 +1,183 @@
+"""A policy on disk and on the wire: safetensors weights and a contract that says what they expect.
+
+A policy folder holds ``weights.safetensors`` (network and observation moments) and ``contract.json`` (what goes in
+and comes out, by name and unit, and how the policy came about). Nothing is pickled.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import BaseModel, ConfigDict, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.normalizer import Moments, normalize
+from common.rally.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, Part
+
+WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
+_OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
+
+
+class PolicyError(ValueError):
+    """A policy that can't be read or doesn't fit: one line that names what was got and what is allowed."""
+
+
+class Contract(BaseModel):
+    """What a policy's weights expect, and where they come from."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: int = 1
+    observation: tuple[dict[str, Any], ...]
+    action: tuple[dict[str, Any], ...]
+    network: NetworkConfig
+    control_rate_hz: float
+    robot: str
+    launch: str
+    noise: str
+    run: str
+    generation: int
+    version: int
+    stage: int
+    frames: int
+    measures: dict[str, Any] = {}
+    made_with: dict[str, str] = {}
+
+
+def _described(layout: tuple[Part, ...]) -> tuple[dict[str, Any], ...]:
+    return tuple(part._asdict() for part in layout)
+
+
+OBSERVATION_CONTRACT, ACTION_CONTRACT = _described(OBSERVATION), _described(ACTION)
+
+
+def task_hash(network: NetworkConfig, env: Mapping[str, Any], launch: str) -> str:
+    """Return a hash of all that a learner and its actors must agree on: layouts, network, task and launches."""
+    task = {
+        "observation": OBSERVATION_CONTRACT,
+        "action": ACTION_CONTRACT,
+        "network": network.model_dump(mode="json"),
+        "env": dict(env),
+        "launch": launch,
+    }
+    return hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def state_tensors(network: ActorCritic) -> dict[str, npt.NDArray[np.float32]]:
+    """Return the network's parameters by name, as copies."""
+    return {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
+
+
+def pack(network: ActorCritic) -> bytes:
+    """Return the network's parameters as a safetensors blob."""
+    return save_tensors(state_tensors(network))
+
+
+def unpack(network: ActorCritic, blob: bytes) -> None:
+    """Load a blob of ``pack`` into ``network``; raises PolicyError where it doesn't fit."""
+    try:
+        tensors = load_tensors(blob)
+    except (SafetensorError, ValueError) as error:
+        raise PolicyError(f"weights are not readable as safetensors: {error}") from None
+    load_state(network, tensors)
+
+
+def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Load parameters by name; raises PolicyError naming the first that is missing, unknown or misshapen."""
+    own = network.state_dict()
+    for name in own.keys() - tensors.keys():
+        raise PolicyError(f"weights lack {name!r}; the network has {', '.join(sorted(own))}")
+    for name, value in tensors.items():
+        if name not in own:
+            raise PolicyError(f"weights hold unknown {name!r}; the network has {', '.join(sorted(own))}")
+        if tuple(own[name].shape) != value.shape:
+            raise PolicyError(f"weights {name!r} have shape {value.shape}; allowed is {tuple(own[name].shape)}")
+    network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in tensors.items()})
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A policy to play: network, frozen normaliser and contract."""
+
+    network: ActorCritic
+    moments: Moments
+    contract: Contract
+
+    def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return the deterministic actions (B, 7) for raw observations (B, 37)."""
+        with torch.inference_mode():
+            mean, _ = self.network(torch.from_numpy(normalize(obs, self.moments)))
+        actions: npt.NDArray[np.float32] = mean.numpy()
+        return actions
+
+
+def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
+    """Write a policy folder; whoever reads it sees the old one or the new one, never a mixture.
+
+    The folder is a symbolic link that is replaced in one step; the folders of older policies go.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    fresh.chmod(0o755)
+    tensors: dict[str, npt.NDArray[Any]] = dict(state_tensors(network))
+    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean, moments.var
+    tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
+    (fresh / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
+    (fresh / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+    old = folder.parent / os.readlink(folder) if folder.is_symlink() else None
+    link = folder.parent / f"{fresh.name}.link"
+    link.symlink_to(fresh.name)
+    os.replace(link, folder)
+    if old is not None:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def load_policy(folder: Path) -> Policy:
+    """Return the policy in ``folder``; raises PolicyError with one line where it can't be used."""
+    folder = Path(os.path.realpath(folder))
+    try:
+        contract = Contract.model_validate_json((folder / CONTRACT_FILE).read_text())
+        tensors = load_tensors((folder / WEIGHTS_FILE).read_bytes())
+    except OSError as error:
+        raise PolicyError(
+            f"no policy in {folder}: {error.strerror} ({Path(error.filename or '').name}); "
+            f"wanted is a folder with {WEIGHTS_FILE} and {CONTRACT_FILE}"
+        ) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise PolicyError(f"{folder / CONTRACT_FILE}: {where or 'file'}: {first['msg']}") from None
+    except (SafetensorError, ValueError) as error:
+        raise PolicyError(f"{folder / WEIGHTS_FILE} is not readable as safetensors: {error}") from None
+    expected = json.loads(json.dumps([OBSERVATION_CONTRACT, ACTION_CONTRACT]))
+    found = json.loads(json.dumps([contract.observation, contract.action]))
+    if found != expected:
+        raise PolicyError(
+            f"{folder / CONTRACT_FILE}: its observation or action layout is not this version's "
+            f"({OBSERVATION_SIZE} and {ACTION_SIZE} numbers, see common/rally/observation.py)"
+        )
+    for name in (_OBS_MEAN, _OBS_VAR, _OBS_COUNT):
+        if name not in tensors:
+            raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
+    moments = Moments(tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)))
+    network = new_network(contract.network)
+    load_state(network, tensors)
+    return Policy(network, moments, contract)
+
+
+def new_network(config: NetworkConfig, home_action: npt.NDArray[np.float32] | None = None) -> ActorCritic:
+    """Return a fresh network for this version's observation and action."""
+    home = np.zeros(ACTION_SIZE, np.float32) if home_action is None else home_action
+    return ActorCritic(OBSERVATION_SIZE, ACTION_SIZE, config, home)

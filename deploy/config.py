@@ -1,0 +1,73 @@
+"""Settings of a whole run on one machine: every process's, and how many there are."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.env.rally_env import EnvConfig
+from common.policy.actor_critic import NetworkConfig
+from services.actor.config import ActorConfig
+from services.evaluator.config import EvaluatorConfig
+from services.generator.config import GeneratorConfig
+from services.learner.config import LearnerConfig
+
+Launch = Literal["paper", "strong", "match"]
+
+
+class DeployConfig(BaseModel):
+    """Settings of a run; task, network, launch preset and seed are given once and handed to every process."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    run: str = Field("", description="name of the run; empty: a time stamp. runs/latest points to it")
+    actors: int = Field(2, ge=1, le=1000, description="actor processes")
+    generators: int = Field(1, ge=1, le=100, description="generator processes")
+    shards: int = Field(0, ge=0, le=4096, description="rally shards; 0: as many as actors")
+    minutes: float = Field(
+        0.0, ge=0, description="stop this long after the first trained batch; 0: the whole curriculum", json_schema_extra={"unit": "min"}
+    )
+    frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
+    resume: bool = Field(False, description="go on with runs/RUN from its newest checkpoint")
+    endpoint: str = Field("", description="where the learner listens; empty: a free port on this machine")
+    metrics_port: int = Field(
+        0, ge=0, le=64000, description="first port of /metrics, one up for each process; 0: any free ones"
+    )
+    panel: Literal["auto", "on", "off"] = Field("auto", description="live terminal panel; auto: if there is a terminal")
+    evaluate: bool = Field(True, description="follow the run with an evaluator, and measure the final policy")
+    final_rallies: int = Field(1000, ge=1, description="rallies of the final measure")
+    seed: int = Field(0, ge=0, lt=2**63, description="of everything random in the run")
+    launch: Launch = Field("paper", description="launch preset of training")
+    env: EnvConfig = EnvConfig()
+    network: NetworkConfig = NetworkConfig()
+    learner: LearnerConfig = LearnerConfig()
+    actor: ActorConfig = ActorConfig()
+    generator: GeneratorConfig = GeneratorConfig()
+    evaluator: EvaluatorConfig = EvaluatorConfig()
+
+
+def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str) -> dict[str, dict[str, Any]]:
+    """Return what each role's section of the run's config.toml says: shared settings are written into each."""
+    shared = {"run": run, "endpoint": endpoint, "seed": config.seed}
+    env, network = config.env.model_dump(), config.network.model_dump()
+    shards = config.shards or config.actors
+    own: dict[str, dict[str, Any]] = {
+        "learner": {
+            "env": env,
+            "network": network,
+            "launch": config.launch,
+            "folder": folder,
+            "minutes": config.minutes,
+            "frames": config.frames,
+            "mode": "hub",
+        },
+        "actor": {"env": env, "network": network, "launch": config.launch, "shards": shards},
+        "generator": {
+            "launch": config.launch,
+            "noise": config.env.noise,
+            "flight": config.env.flight,
+            "shards": shards,
+            "of": config.generators,
+        },
+        "evaluator": {"env": env, "network": network, "launch": config.launch, "noise": config.env.noise, "folder": folder},
+    }
+    return {role: getattr(config, role).model_dump() | shared | values for role, values in own.items()}

@@ -1,0 +1,197 @@
+"""The sending of rollouts as a value: numbered, retried under the same number, one final verdict each.
+
+Pure: the clock is passed in, and whoever owns the network does what `due` says and tells how it went. A
+rollout is *published* when it gets its number. It stays *in flight* through any number of tries (a lost
+answer, a server that is away or busy) until the learner's final verdict, or until it is *dropped*, given up:
+
+    published = accepted + refused + dropped + in flight          (`Counts.balance` is 0, always)
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.comms.messages import FINAL_VERDICTS, ActorReport, Refusal, Verdict, VerdictKind
+
+
+class OutboxConfig(BaseModel):
+    """How an actor sends and retries."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    window: int = Field(2, ge=1, le=2, description="rollouts that may be in flight at once")
+    request_timeout_s: float = Field(
+        10.0, gt=0, description="wait for a verdict before the next try", json_schema_extra={"unit": "s"}
+    )
+    retry_first_s: float = Field(
+        0.1, gt=0, description="pause before the first retry; doubles", json_schema_extra={"unit": "s"}
+    )
+    retry_max_s: float = Field(
+        5.0, gt=0, description="longest pause between retries", json_schema_extra={"unit": "s"}
+    )
+    give_up_s: float = Field(
+        86_400.0, gt=0, description="age at which a rollout is dropped", json_schema_extra={"unit": "s"}
+    )
+
+
+class OutboxFullError(RuntimeError):
+    """A rollout was offered while the window is full."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One rollout on its way."""
+
+    sequence: int
+    payload: bytes
+    born: float  # [s] on the caller's clock
+    tries: int = 0
+    next_try: float = 0.0  # [s]; meaningless while a request is under way
+    under_way: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """An actor's side of the ledger, cumulative over one incarnation."""
+
+    published: int
+    accepted: int
+    refused: Mapping[VerdictKind, int]
+    dropped: int
+    in_flight: int
+
+    @property
+    def balance(self) -> int:
+        """Rollouts that are unaccounted for: 0."""
+        return self.published - self.accepted - sum(self.refused.values()) - self.dropped - self.in_flight
+
+
+@dataclass(frozen=True, slots=True)
+class Outbox:
+    """All rollouts of one incarnation of an actor, and what the learner last said about its wishes."""
+
+    config: OutboxConfig
+    next_sequence: int = 0
+    flights: tuple[Flight, ...] = ()
+    accepted: int = 0
+    refused: tuple[Refusal, ...] = ()
+    dropped: tuple[int, ...] = ()
+    generation: int = 0  # of the learner heard last; 0 is none
+    credit_limit: int = 0
+    credit_version: int = 0
+
+    @property
+    def counts(self) -> Counts:
+        """The ledger."""
+        return Counts(
+            published=self.next_sequence,
+            accepted=self.accepted,
+            refused=Counter(refusal.kind for refusal in self.refused),
+            dropped=len(self.dropped),
+            in_flight=len(self.flights),
+        )
+
+
+def idle_reason(outbox: Outbox, generation: int, version: int) -> str:
+    """Return what keeps the actor from starting a rollout with this policy now, or "" if nothing does."""
+    if len(outbox.flights) >= outbox.config.window:
+        return f"the learner's verdict on rollout {outbox.flights[0].sequence}"
+    if outbox.generation != generation:
+        return "the learner's first word" if outbox.generation < generation else "the new learner's policy"
+    if version < outbox.credit_version:
+        return f"policy version {outbox.credit_version}"
+    if outbox.next_sequence >= outbox.credit_limit:
+        return "the learner's credits"
+    return ""
+
+
+def offer(outbox: Outbox, payload: bytes, now: float) -> Outbox:
+    """Return the outbox with one more rollout, numbered ``outbox.next_sequence``, due at once."""
+    if len(outbox.flights) >= outbox.config.window:
+        raise OutboxFullError(f"{len(outbox.flights)} rollouts in flight; allowed: {outbox.config.window}")
+    flight = Flight(sequence=outbox.next_sequence, payload=payload, born=now, next_try=now)
+    return replace(outbox, next_sequence=outbox.next_sequence + 1, flights=(*outbox.flights, flight))
+
+
+def due(outbox: Outbox, now: float) -> tuple[Flight, ...]:
+    """Return what is to be sent now, oldest first."""
+    return tuple(flight for flight in outbox.flights if not flight.under_way and now >= flight.next_try)
+
+
+def sent(outbox: Outbox, sequence: int) -> Outbox:
+    """Return the outbox after a request for ``sequence`` went out."""
+    return _changed(outbox, sequence, lambda flight: replace(flight, under_way=True, tries=flight.tries + 1))
+
+
+def unanswered(outbox: Outbox, sequence: int, now: float) -> Outbox:
+    """Return the outbox after a request ended without an answer: the same number goes out again later."""
+    return _changed(outbox, sequence, lambda flight: _backed_off(flight, outbox.config, now))
+
+
+def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Outbox:
+    """Return the outbox after a verdict. One on a rollout that is no longer in flight only brings credits."""
+    outbox = credited(outbox, verdict)
+    if sequence not in (flight.sequence for flight in outbox.flights):
+        return outbox
+    # a duplicate's verdict of record stands in ``first``: the answer to an earlier try was lost
+    if verdict.first not in FINAL_VERDICTS:
+        return unanswered(outbox, sequence, now)
+    rest = tuple(flight for flight in outbox.flights if flight.sequence != sequence)
+    if verdict.first is VerdictKind.ACCEPTED:
+        return replace(outbox, flights=rest, accepted=outbox.accepted + 1)
+    refusal = Refusal(sequence=sequence, kind=verdict.first, generation=verdict.generation)
+    return replace(outbox, flights=rest, refused=(*outbox.refused, refusal))
+
+
+def credited(outbox: Outbox, verdict: Verdict) -> Outbox:
+    """Return the outbox with the credits that came with any verdict; those of a dead learner are ignored."""
+    if verdict.generation < outbox.generation:
+        return outbox
+    if verdict.generation > outbox.generation:
+        limit, version = verdict.credit_limit, verdict.credit_version
+    else:
+        limit = max(outbox.credit_limit, verdict.credit_limit)
+        version = max(outbox.credit_version, verdict.credit_version)
+    return replace(outbox, generation=verdict.generation, credit_limit=limit, credit_version=version)
+
+
+def expired(outbox: Outbox, now: float) -> Outbox:
+    """Return the outbox without what is too old to go on trying; a request under way is waited for."""
+    given_up = [
+        flight.sequence
+        for flight in outbox.flights
+        if not flight.under_way and flight.tries > 0 and now - flight.born >= outbox.config.give_up_s
+    ]
+    rest = tuple(flight for flight in outbox.flights if flight.sequence not in given_up)
+    return replace(outbox, flights=rest, dropped=(*outbox.dropped, *given_up))
+
+
+def report(
+    outbox: Outbox, *, run: str, actor: str, incarnation: int, version: int, leaving: bool = False
+) -> ActorReport:
+    """Return what the learner needs to balance its ledger."""
+    return ActorReport(
+        run=run,
+        actor=actor,
+        incarnation=incarnation,
+        version=version,
+        published=outbox.next_sequence,
+        in_flight=tuple(flight.sequence for flight in outbox.flights),
+        dropped=outbox.dropped,
+        generation=outbox.generation,
+        refused=tuple(refusal for refusal in outbox.refused if refusal.generation != outbox.generation),
+        leaving=leaving,
+    )
+
+
+def _changed(outbox: Outbox, sequence: int, change: Callable[[Flight], Flight]) -> Outbox:
+    flights = tuple(change(flight) if flight.sequence == sequence else flight for flight in outbox.flights)
+    return replace(outbox, flights=flights)
+
+
+def _backed_off(flight: Flight, config: OutboxConfig, now: float) -> Flight:
+    doublings = min(flight.tries - 1, 32)  # far beyond any retry_max_s, and no overflow
+    pause_s = min(config.retry_first_s * 2.0**doublings, config.retry_max_s)
+    return replace(flight, under_way=False, next_try=now + pause_s)

@@ -1,0 +1,26 @@
+"""Settings of the evaluator."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from common.env.rally_env import EnvConfig
+from common.service_config import ServiceConfig
+
+
+class EvaluatorConfig(ServiceConfig):
+    """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best."""
+
+    policy: str = Field("", description="policy folder to play once; empty: follow the run")
+    rallies: int = Field(1000, ge=1, le=1_000_000, description="rallies to play; in following, of each evaluation")
+    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
+    rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
+    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    json_line: bool = Field(False, alias="json", description="print the measures as one JSON object, last line")
+    env: EnvConfig = EnvConfig()
+    folder: str = Field("", description="run folder; empty: runs/RUN")
+    interval_s: float = Field(
+        45.0, gt=0, description="following: time between evaluations", json_schema_extra={"unit": "s"}
+    )
+    niceness: int = Field(10, ge=0, le=19, description="following: lets learner and actors go first")

@@ -1,0 +1,67 @@
+"""The measures: rates over valid rallies with Wilson intervals, and the landing error.
+
+catch = legal racket contact / rallies; over = crosses the net after it / rallies; return = legal landing / rallies;
+return after catch = return / catch; target error = planar distance of legal landings to the target.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from common.rally.trajectory import Outcome
+
+Z_95 = 1.959963984540054  # two-sided 95 %
+WITHIN_M = (0.2, 0.3)  # [m] shares of landings nearer than these
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """Rallies that were played to their end, one row each; only validated ones belong here."""
+
+    seeds: npt.NDArray[np.uint64]  # (n,)
+    outcomes: npt.NDArray[np.uint8]  # (n,)
+    landing_errors: npt.NDArray[np.float32]  # (n,) [m], nan where nothing landed
+    caught: npt.NDArray[np.bool_]  # (n,)
+    over: npt.NDArray[np.bool_]  # (n,)
+    returns: npt.NDArray[np.float32]  # (n,) reward
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """Return the 95 % interval of a rate (Wilson 1927); (0, 1) without trials."""
+    if trials == 0:
+        return 0.0, 1.0
+    rate, z2 = successes / trials, Z_95 * Z_95
+    middle = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
+    half = Z_95 * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials * trials)) / (1 + z2 / trials)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def measures(played: Played) -> dict[str, Any]:
+    """Return the measures by name, ready for JSON; a rate without trials is None."""
+    rallies = len(played.outcomes)
+    returned = played.outcomes == Outcome.RETURNED
+    caught, over, landed = int(played.caught.sum()), int(played.over.sum()), int(returned.sum())
+    errors = played.landing_errors[returned].astype(np.float64)
+    result: dict[str, Any] = {"rallies": rallies}
+    for name, successes, trials in (
+        ("catch_rate", caught, rallies),
+        ("over_rate", over, rallies),
+        ("return_rate", landed, rallies),
+        ("return_after_catch", landed, caught),
+    ):
+        result[name] = round(successes / trials, 4) if trials else None
+        result[f"{name}_ci"] = [round(bound, 4) for bound in wilson(successes, trials)]
+    result["target_error_mean"] = round(float(errors.mean()), 4) if landed else None
+    half = Z_95 * float(errors.std(ddof=1)) / math.sqrt(landed) if landed > 1 else None
+    result["target_error_mean_ci"] = (
+        [round(float(errors.mean()) - half, 4), round(float(errors.mean()) + half, 4)] if half is not None else None
+    )
+    result["target_error_median"] = round(float(np.median(errors)), 4) if landed else None
+    for limit in WITHIN_M:
+        result[f"within_{limit:.1f}_m"] = round(float((errors < limit).mean()), 4) if landed else None
+    counts = np.bincount(played.outcomes, minlength=len(Outcome))
+    result["outcomes"] = {outcome.name.lower(): int(counts[outcome]) for outcome in Outcome if counts[outcome]}
+    return result

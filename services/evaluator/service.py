@@ -1,0 +1,233 @@
+"""The evaluator's shell: follows a run, plays fixed rallies with its newest policy, keeps the best."""
+
+import csv
+import logging
+import time
+from collections.abc import Callable
+from threading import Event
+from typing import Any
+
+from common.comms.codec import DecodeError, decode, decode_one_of, encode
+from common.comms.keys import Keys
+from common.comms.messages import Command, Control, ControlReply, PolicySnapshot, Status
+from common.comms.transport import Flow, Reply, Transport
+from common.metrics import Metrics
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import Moments
+from common.policy.weights import (
+    ACTION_CONTRACT,
+    OBSERVATION_CONTRACT,
+    Contract,
+    Policy,
+    PolicyError,
+    new_network,
+    save_policy,
+    unpack,
+)
+from common.run_folder import RunFolder
+from services.evaluator.config import EvaluatorConfig
+from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.measures import measures
+
+log = logging.getLogger(__name__)
+
+IDLE_WAIT_S = 0.2
+CURVE_FILE = "evaluations.csv"
+CURVE = (
+    "version",
+    "frames",
+    "stage",
+    "seconds",
+    "catch_rate",
+    "over_rate",
+    "return_rate",
+    "return_after_catch",
+    "target_error_mean",
+    "target_error_median",
+    "rallies",
+)
+
+
+def score(stage: int, found: dict[str, Any]) -> tuple[int, float, float]:
+    """Return what "best" compares: a later stage first, then what the stage is for, then the landing error."""
+    rate = found["return_rate"] if stage == 3 else found["catch_rate"]
+    error = found["target_error_mean"]
+    return stage, rate or 0.0, -(error if error is not None else 9.9)
+
+
+class EvaluatorService:
+    """Follows one run.
+
+    Args:
+        config: Settings.
+        network: Network's shape, as the learner's.
+        transport: Connection to the hub.
+        metrics: Where its numbers go.
+        incarnation: Of this life.
+        clock: Seconds.
+    """
+
+    def __init__(
+        self,
+        config: EvaluatorConfig,
+        network: NetworkConfig,
+        transport: Transport,
+        metrics: Metrics,
+        incarnation: int,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
+        self._network_config, self._network = network, new_network(network)
+        self._incarnation = incarnation
+        self._keys = keys = Keys(config.run)
+        self._policies = transport.subscribe(keys.policy(), capacity=1)
+        self._control = transport.serve(keys.ctl("evaluator", config.id), capacity=16)
+        self._alive = transport.declare_alive(keys.alive("evaluator", config.id, incarnation))
+        self._folder = RunFolder.of(config.run, config.folder)
+        self._folder.report.mkdir(parents=True, exist_ok=True)
+        self._rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, config.env.flight)
+        self._snapshot: PolicySnapshot | None = None
+        self._played = (-1, -1)
+        self._best: tuple[int, float, float] | None = None
+        self._born = clock()
+        self._next_play = self._born
+        self._next_status = 0.0
+        self._asked = transport.request(keys.policy(), b"", 5.0, Flow.POLICY)
+        self._last: dict[str, float] = {}
+        self._stopping = False
+        self.evaluations = 0
+        self.state = "waiting"
+
+    def run(self, stop: Event) -> None:
+        """Evaluate until ``stop`` is set or a stop is asked for."""
+        while not stop.is_set() and not self._stopping:
+            self.step()
+            self._transport.wait(IDLE_WAIT_S)
+        self._alive.close()
+
+    def step(self) -> None:
+        """Take policies in, and evaluate the newest one if it is time."""
+        self._obey()
+        for sample in self._policies.poll():
+            self._take(sample.payload)
+        outcome = self._asked.poll()
+        if self._snapshot is None and outcome is not None:
+            if isinstance(outcome, Reply):
+                self._take(outcome.payload)
+            else:
+                self._asked = self._transport.request(self._keys.policy(), b"", 5.0, Flow.POLICY)
+        now = self._clock()
+        snapshot = self._snapshot
+        if snapshot and now >= self._next_play and (snapshot.generation, snapshot.version) != self._played:
+            self._played = (snapshot.generation, snapshot.version)
+            self.state = "playing"
+            self._evaluate(snapshot)
+            self._next_play = self._clock() + self._config.interval_s
+            self.state = "waiting"
+        if now >= self._next_status:
+            self._next_status = now + self._config.status_interval_s
+            self._publish_status()
+
+    def _obey(self) -> None:
+        while (request := self._control.poll()) is not None:
+            try:
+                command = decode_one_of(request.payload, (Control,)).command
+            except DecodeError as error:
+                self._refused("control", error)
+                request.refuse()
+                continue
+            self._stopping |= command in (Command.STOP, Command.DRAIN)
+            request.reply(encode(ControlReply(True, self.state, "")))
+
+    def _take(self, payload: bytes) -> None:
+        try:
+            self._snapshot = decode(payload, PolicySnapshot)
+        except DecodeError as error:
+            self._refused("policy", error)
+
+    def _refused(self, kind: str, reason: object) -> None:
+        self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
+        log.warning("message refused kind=%s reason=%s", kind, reason)
+
+    def _evaluate(self, snapshot: PolicySnapshot) -> None:
+        started = self._clock()
+        try:
+            unpack(self._network, snapshot.weights)
+        except PolicyError as error:
+            self._refused("policy", error)
+            return
+        contract = self._contract(snapshot)
+        policy = Policy(self._network, Moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count), contract)
+        env = self._config.env.model_copy(update={"noise": self._config.noise, "rounds": self._config.rounds})
+        found = measures(play_match(policy, self._rallies, env, self._config.envs))
+        self.evaluations += 1
+        seconds = self._clock() - started
+        log.info(
+            "evaluated version=%d frames=%d stage=%d catch=%.3f return=%.3f error=%s seconds=%.1f",
+            snapshot.version,
+            snapshot.frames,
+            snapshot.stage,
+            found["catch_rate"],
+            found["return_rate"],
+            found["target_error_mean"],
+            seconds,
+        )
+        where = {"version": snapshot.version, "frames": snapshot.frames, "stage": snapshot.stage}
+        self._append(found | where | {"seconds": round(self._clock() - self._born, 1)})
+        self._last = {name: float(found[name]) for name in CURVE[4:10] if found.get(name) is not None}
+        self._last |= {"frames": float(snapshot.frames), "stage": float(snapshot.stage)}
+        for metric, name in (
+            ("topspin_catch_rate", "catch_rate"),
+            ("topspin_over_rate", "over_rate"),
+            ("topspin_return_rate", "return_rate"),
+            ("topspin_target_error_meters", "target_error_mean"),
+        ):
+            if found[name] is not None:
+                self._metrics.set(metric, found[name])
+        self._metrics.set("topspin_policy_version", snapshot.version)
+        self._metrics.inc("topspin_phase_seconds_total", seconds, phase="evaluate")
+        self._metrics.inc("topspin_episodes_total", found["rallies"])
+        reached = score(snapshot.stage, found)
+        if self._best is None or reached > self._best:
+            self._best = reached
+            save_policy(
+                self._folder.best_policy, policy.network, policy.moments, contract.model_copy(update={"measures": found})
+            )
+
+    def _contract(self, snapshot: PolicySnapshot) -> Contract:
+        env = self._config.env
+        return Contract(
+            observation=OBSERVATION_CONTRACT,
+            action=ACTION_CONTRACT,
+            network=self._network_config,
+            control_rate_hz=env.control_rate_hz,
+            robot=env.robot,
+            launch=self._config.launch,
+            noise=env.noise,
+            run=snapshot.run,
+            generation=snapshot.generation,
+            version=snapshot.version,
+            stage=snapshot.stage,
+            frames=snapshot.frames,
+        )
+
+    def _append(self, values: dict[str, Any]) -> None:
+        path = self._folder.report / CURVE_FILE
+        is_new = not path.exists()
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=CURVE, extrasaction="ignore")
+            if is_new:
+                writer.writeheader()
+            writer.writerow(values)
+
+    def _publish_status(self) -> None:
+        status = Status(
+            role="evaluator",
+            id=self._config.id,
+            incarnation=self._incarnation,
+            time=time.time(),
+            state=self.state,
+            counters={"evaluations": float(self.evaluations)},
+            gauges=self._last,
+        )
+        self._transport.publish(self._keys.status("evaluator", self._config.id), encode(status), Flow.STATUS)

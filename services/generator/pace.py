@@ -1,0 +1,37 @@
+"""How fast a generator publishes, and to which shards: functions of numbers and of the time passed in."""
+
+
+def shards_of(index: int, of: int, shards: int) -> tuple[int, ...]:
+    """Return the shards that generator ``index`` of ``of`` fills; with more generators than shards they share."""
+    if not 0 <= index < of:
+        raise ValueError(f"generator index {index}; allowed are 0 to {of - 1}")
+    return tuple(range(index, shards, of)) or (index % shards,)
+
+
+class Pace:
+    """Batches at a steady rate, without catching up on what was not wanted while idle.
+
+    Args:
+        rate_hz: Rallies a second.
+        batch: Rallies a batch.
+    """
+
+    def __init__(self, rate_hz: float, batch: int) -> None:
+        self._period = batch / rate_hz
+        self._next = 0.0
+
+    def due(self, now: float) -> bool:
+        """Return whether a batch is due, and reckon it as sent if so."""
+        if now < self._next:
+            return False
+        # A late batch shifts those that follow: a stall must not end in a burst.
+        self._next = max(self._next + self._period, now)
+        return True
+
+    def wait(self, now: float) -> float:
+        """Return how long until the next batch is due [s]."""
+        return max(0.0, self._next - now)
+
+    def idle(self, now: float) -> None:
+        """Nobody listens: whoever comes gets the first batch at once."""
+        self._next = now

@@ -1,0 +1,179 @@
+"""What became of every rollout of every actor: the learner's memory, and the ledger that is counted from it.
+
+    published = trained + refused(reason) + dropped + in flight + lost        (`Ledger.balance` is 0, always)
+
+Two sides know parts of it. The learner knows the fate of what reached it. Of what did not, or reached only a
+learner that has died since, the actor's report tells: given up (dropped), refused by a dead learner, accepted
+by a dead learner (lost: no update of this one will use it). All of that is final, so a report may be late or
+repeated. What then remains missing is in flight, or lost once the actor is dead.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+
+from common.comms.messages import ActorReport, VerdictKind
+
+
+class Fate(StrEnum):
+    """What became of a rollout that was not refused."""
+
+    QUEUED = "queued"  # accepted, and an update will use it
+    TRAINED = "trained"
+    LOST = "lost"  # accepted, and thrown away untrained
+    DROPPED = "dropped"  # given up by its actor
+
+
+FATES = frozenset(fate.value for fate in Fate)
+
+Outcome = Fate | VerdictKind  # a kind of verdict stands for the refusal
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """The account of one incarnation of an actor, or the sum of several."""
+
+    published: int = 0
+    trained: int = 0
+    refused: Mapping[VerdictKind, int] = field(default_factory=lambda: MappingProxyType({}))
+    dropped: int = 0
+    in_flight: int = 0
+    lost: int = 0
+
+    @property
+    def balance(self) -> int:
+        """Rollouts that are unaccounted for: 0."""
+        accounted = self.trained + sum(self.refused.values()) + self.dropped + self.in_flight + self.lost
+        return self.published - accounted
+
+    def __add__(self, other: "Ledger") -> "Ledger":
+        """Return the account of both together."""
+        return Ledger(
+            published=self.published + other.published,
+            trained=self.trained + other.trained,
+            refused=MappingProxyType(Counter(self.refused) + Counter(other.refused)),
+            dropped=self.dropped + other.dropped,
+            in_flight=self.in_flight + other.in_flight,
+            lost=self.lost + other.lost,
+        )
+
+
+Span = tuple[int, int]  # half-open range of sequence numbers
+
+
+@dataclass(frozen=True, slots=True)
+class Remembered:
+    """One incarnation as a checkpoint keeps it: plain values that JSON can hold."""
+
+    actor: str
+    incarnation: int
+    published: int
+    outcomes: tuple[tuple[str, tuple[Span, ...]], ...]  # which sequence numbers ended how
+
+
+class Account:
+    """What the learner knows about one incarnation of one actor."""
+
+    def __init__(self, actor: str, incarnation: int) -> None:
+        self.actor = actor
+        self.incarnation = incarnation
+        self.is_alive = True
+        self.last_heard = 0.0  # [s] on the caller's clock
+        self.credit_limit = 0
+        self._outcomes: dict[int, Outcome] = {}
+        self._counts: Counter[Outcome] = Counter()
+        self._missing: set[int] = set()  # published, and no outcome known
+        self._published = 0
+        self._highest = -1
+
+    @property
+    def published(self) -> int:
+        """How many sequence numbers are known to be used."""
+        return self._published
+
+    @property
+    def missing(self) -> int:
+        """How many of them we know nothing else about: under way to us, as long as the actor lives."""
+        return len(self._missing)
+
+    @property
+    def gaps(self) -> int:
+        """How many numbers are missing below the highest that came; with a window of 2, one may yet come."""
+        return sum(sequence < self._highest for sequence in self._missing)
+
+    def outcome(self, sequence: int) -> Outcome | None:
+        """Return what became of a rollout, or None."""
+        return self._outcomes.get(sequence)
+
+    def settle(self, sequence: int, outcome: Outcome) -> None:
+        """Write down what became of a rollout."""
+        self._publish_up_to(sequence + 1)
+        self._missing.discard(sequence)
+        if (before := self._outcomes.get(sequence)) is not None:
+            self._counts[before] -= 1
+        self._outcomes[sequence] = outcome
+        self._counts[outcome] += 1
+        self._highest = max(self._highest, sequence)
+
+    def hear(self, report: ActorReport, generation: int) -> None:
+        """Take over what the actor knows and the learner of ``generation`` may not."""
+        self._publish_up_to(report.published)
+        elsewhere: dict[int, Outcome] = {refusal.sequence: refusal.kind for refusal in report.refused}
+        elsewhere.update(dict.fromkeys(report.dropped, Fate.DROPPED))
+        if report.generation == generation:
+            # what it doesn't list was accepted, and not by us; before it has heard us, it can't tell yet
+            unlisted = set(range(report.published)) - set(report.in_flight) - elsewhere.keys()
+            elsewhere.update(dict.fromkeys(unlisted & self._missing, Fate.LOST))
+        for sequence in elsewhere.keys() & self._missing:
+            self.settle(sequence, elsewhere[sequence])
+
+    def ledger(self) -> Ledger:
+        """Return the account."""
+        missing = len(self._missing)
+        refused = {kind: self._counts[kind] for kind in VerdictKind if self._counts[kind]}
+        return Ledger(
+            published=self._published,
+            trained=self._counts[Fate.TRAINED],
+            refused=MappingProxyType(refused),
+            dropped=self._counts[Fate.DROPPED],
+            in_flight=self._counts[Fate.QUEUED] + (missing if self.is_alive else 0),
+            lost=self._counts[Fate.LOST] + (0 if self.is_alive else missing),
+        )
+
+    def remember(self) -> Remembered:
+        """Return what a checkpoint keeps."""
+        by_outcome: dict[str, list[int]] = {}
+        for sequence, outcome in sorted(self._outcomes.items()):
+            by_outcome.setdefault(outcome.value, []).append(sequence)
+        outcomes = tuple((name, spans(numbers)) for name, numbers in sorted(by_outcome.items()))
+        return Remembered(self.actor, self.incarnation, self._published, outcomes)
+
+    def _publish_up_to(self, published: int) -> None:
+        self._missing.update(range(self._published, published))
+        self._published = max(self._published, published)
+
+
+def restored(memory: Remembered) -> Account:
+    """Return the account of a checkpoint; what was queued then died with that learner and is lost."""
+    account = Account(memory.actor, memory.incarnation)
+    account.is_alive = False  # until it is heard of
+    for name, ranges in memory.outcomes:
+        outcome: Outcome = Fate(name) if name in FATES else VerdictKind(name)
+        for first, end in ranges:
+            for sequence in range(first, end):
+                account.settle(sequence, Fate.LOST if outcome is Fate.QUEUED else outcome)
+    account._publish_up_to(memory.published)
+    return account
+
+
+def spans(numbers: Iterable[int]) -> tuple[Span, ...]:
+    """Return increasing numbers as half-open ranges."""
+    ranges: list[list[int]] = []
+    for number in numbers:
+        if ranges and ranges[-1][1] == number:
+            ranges[-1][1] = number + 1
+        else:
+            ranges.append([number, number + 1])
+    return tuple((first, end) for first, end in ranges)

@@ -1,0 +1,105 @@
+"""A run's record: one row an epoch, in metrics.csv and as TensorBoard events."""
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from common.rally.reward import TERMS
+from common.rally.trajectory import Outcome
+from services.learner.training import EpochStats
+
+if TYPE_CHECKING:
+    from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+
+def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, float]:
+    """Return what is recorded of an epoch, by column; rates are of rallies with exploration noise."""
+    play, update, progress = stats.play, stats.update, stats.progress
+    rallies = max(play.rallies, 1)
+    result = {
+        "epoch": progress.epoch,
+        "frames": progress.frames,
+        "seconds": round(seconds, 3),
+        "frames_per_s": round(frames_per_s, 1),
+        "stage": progress.stage,
+        "version": progress.version,
+        "lag": stats.lag,
+        "rallies": play.rallies,
+        "unvalidated": play.unvalidated,
+        "catch_rate": play.caught / rallies,
+        "over_rate": play.over / rallies,
+        "return_rate": play.returned / rallies,
+        "target_error": play.error_sum / play.returned if play.returned else float("nan"),
+        "episode_return": play.mean_return,
+        "policy_loss": update.policy_loss,
+        "value_loss": update.value_loss,
+        "bound_loss": update.bound_loss,
+        "entropy": update.entropy,
+        "kl": update.kl,
+        "clip_fraction": update.clip_fraction,
+        "importance_weight": update.weight,
+        "gradient_norm": update.gradient_norm,
+        "explained_variance": update.explained_variance,
+        "learning_rate": update.learning_rate,
+    }
+    result.update({f"reward_{name}": float(value) for name, value in zip(TERMS, play.reward_terms, strict=True)})
+    result.update({f"outcome_{o.name.lower()}": int(play.outcomes[o]) for o in Outcome if o is not Outcome.NONE})
+    return result
+
+
+class Record:
+    """Appends rows to the run folder; a resumed run goes on in the same file.
+
+    Args:
+        metrics: The CSV file.
+        tensorboard: Folder of the events.
+    """
+
+    def __init__(self, metrics: Path, tensorboard: Path) -> None:
+        self._path = metrics
+        self._tensorboard = tensorboard
+        self._events: EventFileWriter | None = None
+
+    def append(self, values: dict[str, float]) -> None:
+        """Write one epoch's row."""
+        is_new = not self._path.exists() or self._path.stat().st_size == 0
+        with self._path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, fieldnames=list(values))
+            if is_new:
+                writer.writeheader()
+            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
+        self._write_events(values)
+
+    def truncate(self, epoch: int) -> None:
+        """Drop rows after ``epoch``: epochs that a resumed run trains again."""
+        if not self._path.exists():
+            return
+        with self._path.open(newline="") as file:
+            lines = file.readlines()
+        kept = lines[:1] + [line for line in lines[1:] if int(line.split(",", 1)[0]) <= epoch]
+        self._path.write_text("".join(kept))
+
+    def close(self) -> None:
+        """Flush what TensorBoard holds."""
+        if self._events is not None:
+            self._events.close()
+
+    def _write_events(self, values: dict[str, float]) -> None:
+        # Imported late: TensorBoard takes a second that the first batch should not wait for.
+        from tensorboard.compat.proto.event_pb2 import Event  # noqa: PLC0415
+        from tensorboard.compat.proto.summary_pb2 import Summary  # noqa: PLC0415
+        from tensorboard.summary.writer.event_file_writer import EventFileWriter  # noqa: PLC0415
+
+        if self._events is None:
+            self._events = EventFileWriter(str(self._tensorboard))
+        group: dict[str, Any] = {"reward": "reward", "outcome": "outcome"}
+        summary = Summary(
+            value=[
+                Summary.Value(
+                    tag=f"{group.get(name.split('_')[0], 'training')}/{name}", simple_value=float(value)
+                )
+                for name, value in values.items()
+                if name not in ("epoch", "frames")
+            ]
+        )
+        self._events.add_event(Event(step=int(values["frames"]), summary=summary))

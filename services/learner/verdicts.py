@@ -1,0 +1,116 @@
+"""The verdict on a rollout as one table of rules; the first that speaks decides.
+
+Identity comes first, then the verdict of record: a number that has one gets it again whatever has changed
+since, so that an actor whose answer was lost and the learner never disagree.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Final
+
+from common.comms.codec import DecodeError, decode, salvage
+from common.comms.messages import Rollout, VerdictKind
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where the learner is."""
+
+    run: str
+    generation: int
+    version: int
+    stage_number: int
+    stage: int
+    contract_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What a verdict depends on, of one rollout. ``fault`` says why its content can't be used."""
+
+    run: str
+    generation: int
+    version: int
+    stage_number: int
+    actor: str
+    incarnation: int
+    sequence: int
+    contract_hash: str
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """All that the rules look at."""
+
+    header: Header
+    standing: Standing
+    is_known: bool  # its number has a verdict
+    queued: int
+    queue_limit: int
+    version_at_use: int  # that the learner will have when an update gets to this rollout
+    max_lag: int
+
+
+def _differs(what: str, got: object, wanted: object) -> str:
+    return "" if got == wanted else f"{what} {got}; allowed: {wanted}"
+
+
+def _ahead(case: Case) -> str:
+    newest = case.standing.version
+    is_ahead = case.header.generation == case.standing.generation and case.header.version > newest
+    return f"version {case.header.version}; the newest is {newest}" if is_ahead else ""
+
+
+def _too_old(case: Case) -> str:
+    version, at_use = case.header.version, case.version_at_use
+    is_too_old = at_use - version > case.max_lag
+    return f"version {version} would be used at {at_use}; allowed lag: {case.max_lag}" if is_too_old else ""
+
+
+# Each rule returns why it applies, or "".
+RULES: Final[tuple[tuple[VerdictKind, Callable[[Case], str]], ...]] = (
+    (VerdictKind.WRONG_RUN, lambda case: _differs("run", case.header.run, case.standing.run)),
+    (VerdictKind.DUPLICATE, lambda case: "this number has a verdict already" if case.is_known else ""),
+    (VerdictKind.INVALID, lambda case: case.header.fault or _ahead(case)),
+    (
+        VerdictKind.WRONG_GENERATION,
+        lambda case: _differs("generation", case.header.generation, case.standing.generation),
+    ),
+    (
+        VerdictKind.WRONG_CONTRACT,
+        lambda case: _differs("contract", case.header.contract_hash, case.standing.contract_hash),
+    ),
+    (
+        VerdictKind.STALE_STAGE,
+        lambda case: _differs("stage number", case.header.stage_number, case.standing.stage_number),
+    ),
+    (VerdictKind.TOO_OLD, _too_old),
+    (
+        VerdictKind.BUSY,
+        lambda case: f"{case.queued} wait" if case.queued >= case.queue_limit else "",
+    ),
+    (VerdictKind.ACCEPTED, lambda case: "in the queue"),
+)
+
+_HEADER_FIELDS: Final = tuple(field.name for field in fields(Header) if field.name != "fault")
+
+
+def judge(case: Case) -> tuple[VerdictKind, str]:
+    """Return the first rule that applies, and why."""
+    return next((kind, reason) for kind, rule in RULES if (reason := rule(case)))
+
+
+def open_rollout(payload: bytes, limit_bytes: int) -> tuple[Header, Rollout | None] | None:
+    """Return what a verdict depends on, and the rollout, or None where it is invalid.
+
+    None alone means that nobody can say whose it was.
+    """
+    try:
+        rollout = decode(payload, Rollout, limit_bytes=limit_bytes)
+    except DecodeError as error:
+        found = salvage(payload, Rollout, _HEADER_FIELDS)
+        if found.keys() != set(_HEADER_FIELDS):
+            return None
+        return Header(**found, fault=str(error)), None
+    return Header(**{name: getattr(rollout, name) for name in _HEADER_FIELDS}), rollout

@@ -1,0 +1,45 @@
+"""Builders for the tests of the outbox, the intake and their ledger."""
+
+import dataclasses
+from typing import Any
+
+from common.comms.messages import Verdict, VerdictKind
+from services.learner.intake import Intake, IntakeConfig
+from services.learner.verdicts import Header, Standing
+from tests.unit.comms.message_examples import make_rollout
+
+STANDING = Standing(run="night", generation=1, version=10, stage_number=2, stage=3, contract_hash="c0ffee")
+ROLLOUT = make_rollout()
+
+
+def make_header(sequence: int = 0, **changes: Any) -> Header:
+    header = Header(
+        run="night",
+        generation=1,
+        version=10,
+        stage_number=2,
+        actor="actor-0",
+        incarnation=1,
+        sequence=sequence,
+        contract_hash="c0ffee",
+    )
+    return dataclasses.replace(header, **changes)
+
+
+def make_intake(*, standing: Standing = STANDING, **settings: Any) -> Intake:
+    return Intake(IntakeConfig(**{"dataset_rollouts": 4, **settings}), standing)
+
+
+def make_verdict(kind: VerdictKind, **changes: Any) -> Verdict:
+    verdict = Verdict(
+        kind=kind,
+        first=kind,
+        reason="",
+        generation=1,
+        version=10,
+        stage_number=2,
+        stage=3,
+        credit_limit=2,
+        credit_version=10,
+    )
+    return dataclasses.replace(verdict, **changes)

@@ -1,0 +1,207 @@
+import dataclasses
+
+import msgpack
+import pytest
+
+from common.comms.codec import encode
+from common.comms.messages import VerdictKind
+from services.learner.intake import Intake, IntakeConfig
+from services.learner.ledger import Account, Fate, restored, spans
+from services.learner.verdicts import RULES, open_rollout
+from tests.unit.comms.message_examples import make_rollout
+from tests.unit.comms.test_codec import sealed
+from tests.unit.services.accounting import ROLLOUT, STANDING, make_header, make_intake
+
+LIMIT = 2**20
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind", "reason"),
+    [
+        ({}, VerdictKind.ACCEPTED, "in the queue"),
+        ({"run": "day"}, VerdictKind.WRONG_RUN, "run day; allowed: night"),
+        ({"fault": "Rollout.obs: nan"}, VerdictKind.INVALID, "Rollout.obs: nan"),
+        ({"version": 11}, VerdictKind.INVALID, "version 11; the newest is 10"),
+        ({"generation": 0, "version": 99}, VerdictKind.WRONG_GENERATION, "generation 0; allowed: 1"),
+        ({"contract_hash": "f00"}, VerdictKind.WRONG_CONTRACT, "contract f00; allowed: c0ffee"),
+        ({"stage_number": 1}, VerdictKind.STALE_STAGE, "stage number 1; allowed: 2"),
+        ({"version": 8}, VerdictKind.ACCEPTED, "in the queue"),
+        ({"version": 7}, VerdictKind.TOO_OLD, "version 7 would be used at 10; allowed lag: 2"),
+        ({"version": 7, "stage_number": 1}, VerdictKind.STALE_STAGE, "stage number"),
+        ({"fault": "bad", "generation": 0}, VerdictKind.INVALID, "bad"),
+    ],
+)
+def test_the_first_rule_that_applies_decides(changes, kind, reason):
+    verdict = make_intake().arrive(make_header(**changes), ROLLOUT, now=0.0)
+
+    assert verdict.kind is verdict.first is kind
+    assert reason in verdict.reason
+
+
+def test_every_kind_of_verdict_on_a_rollout_has_its_rule():
+    others = {VerdictKind.UNREADABLE, VerdictKind.CREDITS}
+
+    assert [kind for kind, _ in RULES][-1] is VerdictKind.ACCEPTED
+    assert {kind for kind, _ in RULES} == set(VerdictKind) - others
+
+
+def test_a_retry_gets_the_verdict_of_record_whatever_has_changed_since():
+    intake = make_intake(dataset_rollouts=1)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    intake.arrive(make_header(1, stage_number=1), ROLLOUT, 0.0)
+    intake.take_dataset()
+    intake.finish_update(dataclasses.replace(STANDING, version=50, stage_number=3))
+
+    accepted, refused = (
+        intake.arrive(make_header(0), ROLLOUT, 0.0),
+        intake.arrive(make_header(1), ROLLOUT, 0.0),
+    )
+
+    assert (accepted.kind, accepted.first) == (VerdictKind.DUPLICATE, VerdictKind.ACCEPTED)
+    assert (refused.kind, refused.first) == (VerdictKind.DUPLICATE, VerdictKind.STALE_STAGE)
+    assert intake.queued == 0
+
+
+def test_a_full_queue_is_busy_and_leaves_the_verdict_open():
+    intake = make_intake(dataset_rollouts=1, queue_rollouts=1)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+
+    assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.BUSY
+    intake.take_dataset()
+    assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.ACCEPTED
+
+
+def test_lag_is_counted_to_where_a_rollout_will_be_used():
+    intake = make_intake(dataset_rollouts=2, max_lag=1)
+    kinds = [intake.arrive(make_header(sequence), ROLLOUT, 0.0).kind for sequence in range(5)]
+
+    # numbers 0, 1 meet version 10, numbers 2, 3 meet 11, number 4 would meet 12
+    assert kinds == [VerdictKind.ACCEPTED] * 4 + [VerdictKind.TOO_OLD]
+
+
+def test_with_no_lag_allowed_nothing_is_accepted_during_an_update():
+    intake = make_intake(dataset_rollouts=1, max_lag=0)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    intake.take_dataset()
+
+    assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.TOO_OLD
+
+
+def test_datasets_are_whole_in_order_and_one_at_a_time():
+    intake = make_intake(dataset_rollouts=2)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    assert intake.take_dataset() == ()
+    intake.arrive(make_header(1), ROLLOUT, 0.0)
+
+    assert [entry.header.sequence for entry in intake.take_dataset()] == [0, 1]
+    with pytest.raises(RuntimeError, match="an update of 2 rollouts is running"):
+        intake.take_dataset()
+
+
+def test_what_waits_at_a_stage_change_is_lost_and_counted():
+    intake = make_intake(dataset_rollouts=1)
+    for sequence in range(3):
+        intake.arrive(make_header(sequence), ROLLOUT, 0.0)
+    intake.take_dataset()
+    intake.finish_update(dataclasses.replace(STANDING, version=11, stage_number=3))
+
+    ledger = intake.ledgers()["actor-0", 1]
+    assert (ledger.trained, ledger.lost, ledger.in_flight, ledger.balance) == (1, 2, 0, 0)
+
+
+def test_an_abandoned_update_is_lost():
+    intake = make_intake(dataset_rollouts=1)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    intake.take_dataset()
+    intake.abandon_update()
+
+    assert intake.ledgers()["actor-0", 1].lost == 1
+
+
+def test_a_dead_actors_missing_rollouts_are_lost_until_it_is_heard_again():
+    intake = make_intake()
+    intake.arrive(make_header(3), ROLLOUT, 0.0)
+    assert intake.ledgers()["actor-0", 1].in_flight == 4
+    assert intake.gaps() == 3
+
+    intake.gone("actor-0", 1)
+    assert intake.ledgers()["actor-0", 1].lost == 3
+    intake.arrive(make_header(4), ROLLOUT, 0.0)
+
+    assert intake.ledgers()["actor-0", 1].lost == 0
+
+
+def test_a_namesake_from_another_run_gets_no_account():
+    intake = make_intake()
+
+    assert intake.arrive(make_header(run="day"), ROLLOUT, 0.0).credit_limit == 0
+    assert intake.ledgers() == {}
+
+
+def test_limits_add_up_to_what_is_wanted_and_the_window():
+    intake = make_intake(dataset_rollouts=3, max_lag=0, window=2)
+    limits = [intake.arrive(make_header(actor=f"actor-{i}"), ROLLOUT, 0.0).credit_limit for i in range(3)]
+
+    # of 3 wanted, the first arrival leaves 2: both go to actor-0, which may publish numbers 1 and 2
+    assert limits == [3, 0, 0]
+
+
+def test_credits_of_the_silent_and_of_the_dead_go_to_others():
+    intake = make_intake(dataset_rollouts=4, max_lag=0, window=2, credit_patience_s=30.0)
+    intake.arrive(make_header(actor="silent"), ROLLOUT, now=0.0)
+
+    # 4 wanted, 2 there, 2 promised to the silent one
+    assert intake.arrive(make_header(actor="eager"), ROLLOUT, now=29.0).credit_limit == 0
+    assert intake.arrive(make_header(1, actor="eager"), ROLLOUT, now=31.0).credit_limit == 3
+    intake = make_intake(dataset_rollouts=4, max_lag=0, window=2)
+    intake.arrive(make_header(actor="dead"), ROLLOUT, now=0.0)
+    intake.gone("dead", 1)
+    assert intake.arrive(make_header(actor="eager"), ROLLOUT, now=1.0).credit_limit == 3
+
+
+def test_a_rollout_that_cannot_be_read_is_named_if_its_header_can():
+    kind, version, fields = msgpack.unpackb(encode(make_rollout())[12:])
+    fields["log_mu"] = 3
+    payload = sealed(msgpack.packb([kind, version, fields]))
+
+    header, rollout = open_rollout(payload, LIMIT)
+
+    assert rollout is None
+    assert (header.actor, header.sequence) == ("actor-0", 11)
+    assert "Rollout.log_mu: 3" in header.fault
+    assert open_rollout(payload[:-1], LIMIT) is None
+    header, rollout = open_rollout(encode(make_rollout()), LIMIT)
+    assert header.fault == ""
+    assert rollout.sequence == 11
+
+
+def test_a_checkpoint_remembers_every_outcome_and_what_was_queued_is_lost():
+    intake = make_intake(dataset_rollouts=2)
+    for sequence in (0, 1, 2, 5):
+        intake.arrive(make_header(sequence), ROLLOUT, 0.0)
+    intake.arrive(make_header(6, stage_number=0), ROLLOUT, 0.0)
+    intake.take_dataset()
+    intake.finish_update(dataclasses.replace(STANDING, version=11))
+
+    again = Intake(IntakeConfig(), dataclasses.replace(STANDING, generation=2), intake.memory())
+
+    ledger = again.ledgers()["actor-0", 1]
+    assert (ledger.published, ledger.trained, ledger.lost) == (7, 2, 4)
+    assert ledger.refused == {VerdictKind.STALE_STAGE: 1}
+    assert ledger.balance == 0
+    verdict = again.arrive(make_header(0), ROLLOUT, 0.0)
+    assert (verdict.kind, verdict.first) == (VerdictKind.DUPLICATE, VerdictKind.ACCEPTED)
+
+
+def test_spans_hold_numbers_as_ranges():
+    assert spans([]) == ()
+    assert spans([0, 1, 2, 5, 7, 8]) == ((0, 3), (5, 6), (7, 9))
+
+
+def test_a_restored_account_settles_nothing_twice():
+    account = Account("a", 1)
+    account.settle(0, Fate.QUEUED)
+    account.settle(0, Fate.TRAINED)
+
+    assert account.ledger().trained == 1
+    assert account.ledger() == restored(account.remember()).ledger()
