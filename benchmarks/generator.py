@@ -13,7 +13,8 @@ from dataclasses import asdict, dataclass
 from common.comms.codec import decode, encode
 from common.comms.messages import RallyBatch
 from common.rally.launch import draw_rallies
-from common.rally.launch_presets import AIR_FACTORS, PRESETS
+from common.rally.launch_presets import PRESETS
+from common.rally.noise import PROFILES
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--preset", choices=PRESETS, default="paper", help="which launches are drawn")
-    parser.add_argument("--noise", choices=AIR_FACTORS, default="standard", help="how far drag and lift vary")
+    parser.add_argument("--noise", choices=PROFILES, default="standard", help="how far drag and lift vary")
     parser.add_argument(
         "--batch", type=int, default=500, metavar="N", help="valid rallies per message, 1 or more"
     )

@@ -9,7 +9,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -20,16 +20,18 @@ _COMMON = Path(__file__).parent
 
 def _source_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in sorted([*_COMMON.glob("physics/*.py"), *_COMMON.glob("rally/*.py"), *_COMMON.glob("env/*.py")]):
+    folders = ("physics", "rally", "env")
+    for path in sorted(path for folder in folders for path in _COMMON.glob(f"{folder}/*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    numba.config.CACHE_DIR = str(_COMMON.parent / ".numba_cache" / _source_digest())
+    # numba makes its settings attributes when it is imported
+    numba.config.CACHE_DIR = str(_COMMON.parent / ".numba_cache" / _source_digest())  # type: ignore[attr-defined]
 
 
 def kernel(function: _Kernel) -> _Kernel:
-    """Return ``function`` compiled: cached, GIL released, IEEE arithmetic (no fastmath: equal inputs, equal bits)."""
-    compiled: _Kernel = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    """Return ``function`` compiled: cached, GIL released, no fastmath: equal inputs give equal bits."""
+    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return cast(_Kernel, compiled)

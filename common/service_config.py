@@ -4,24 +4,16 @@ import os
 import time
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+from common.comms.zenoh_config import ZenohConfig
 
 
-class ServiceConfig(BaseModel):
-    """Settings shared by all services."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class ServiceConfig(ZenohConfig):
+    """Settings shared by all services, the way to the hub among them."""
 
     run: str = Field("default", description="run this service belongs to; part of every key")
     id: str = Field("0", description="name of this service among those of its role")
-    endpoint: str = Field(
-        DEFAULT_ENDPOINT, description="hub: the learner listens here, or with --hub client dials it like the others"
-    )
-    connect_timeout_s: float = Field(
-        60.0, gt=0, description="how long to wait for the hub before giving up", json_schema_extra={"unit": "s"}
-    )
     metrics_port: int = Field(0, ge=0, le=65535, description="HTTP port of /metrics; 0 takes any free one")
     metrics_host: str = Field("127.0.0.1", description="address that /metrics is served on")
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe lines logged")

@@ -48,7 +48,7 @@ class DeployConfig(BaseModel):
 def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str) -> dict[str, dict[str, Any]]:
     """Return what each role's section of the run's config.toml says: shared settings are written into each."""
     shared = {"run": run, "endpoint": endpoint, "seed": config.seed}
-    env, network = config.env.model_dump(), config.network.model_dump()
+    env, network = config.env.model_dump(mode="json"), config.network.model_dump(mode="json")
     shards = config.shards or config.actors
     own: dict[str, dict[str, Any]] = {
         "learner": {
@@ -70,4 +70,4 @@ def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str)
         },
         "evaluator": {"env": env, "network": network, "launch": config.launch, "noise": config.env.noise, "folder": folder},
     }
-    return {role: getattr(config, role).model_dump() | shared | values for role, values in own.items()}
+    return {role: getattr(config, role).model_dump(mode="json", by_alias=True) | shared | values for role, values in own.items()}

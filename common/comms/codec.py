@@ -19,7 +19,7 @@ import zlib
 from collections.abc import Mapping
 from enum import Enum
 from types import MappingProxyType
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, overload
 
 import msgpack
 import numpy as np
@@ -42,6 +42,7 @@ class EncodeError(ValueError):
 
 
 _M = TypeVar("_M", bound=Message)
+_N = TypeVar("_N", bound=Message)
 
 
 def encode(message: Message) -> bytes:
@@ -57,21 +58,39 @@ def encode(message: Message) -> bytes:
 
 def decode(payload: bytes, expected: type[_M], *, limit_bytes: int = DEFAULT_LIMIT_BYTES) -> _M:
     """Return the message in ``payload``, checked. Raises DecodeError, and nothing else, for any bytes."""
-    name = expected.__name__
+    return typing.cast(_M, _decode(payload, (expected,), limit_bytes))
+
+
+@overload
+def decode_one_of(payload: bytes, expected: tuple[type[_M]], *, limit_bytes: int = ...) -> _M: ...
+@overload
+def decode_one_of(
+    payload: bytes, expected: tuple[type[_M], type[_N]], *, limit_bytes: int = ...
+) -> _M | _N: ...
+def decode_one_of(
+    payload: bytes, expected: tuple[type[Message], ...], *, limit_bytes: int = DEFAULT_LIMIT_BYTES
+) -> Any:
+    """Return the message in ``payload``, which may be of any of these types; otherwise as `decode`."""
+    return _decode(payload, expected, limit_bytes)
+
+
+def _decode(payload: bytes, expected: tuple[type[Message], ...], limit_bytes: int) -> Any:
+    names = " or ".join(kind.__name__ for kind in expected)
     if len(payload) > limit_bytes:
-        raise DecodeError(f"{name}: {len(payload)} bytes; allowed: up to {limit_bytes}")
-    content = _unpack(_body(payload, name), name)
+        raise DecodeError(f"{names}: {len(payload)} bytes; allowed: up to {limit_bytes}")
+    content = _unpack(_body(payload, names), names)
     if not (isinstance(content, list) and len(content) == 3 and isinstance(content[2], dict)):
-        raise DecodeError(f"{name}: the body is not [type, version, fields]")
+        raise DecodeError(f"{names}: the body is not [type, version, fields]")
     got_type, got_version, fields = content
-    if got_type != name:
-        raise DecodeError(f"got a message of type {_short(got_type)}; allowed here: {name}")
-    if type(got_version) is not int or got_version != expected.VERSION:
+    kind = next((kind for kind in expected if kind.__name__ == got_type), None)
+    if kind is None:
+        raise DecodeError(f"got a message of type {_short(got_type)}; allowed here: {names}")
+    if type(got_version) is not int or got_version != kind.VERSION:
         raise DecodeError(
-            f"{name}: version {_short(got_version)}; this side speaks {expected.VERSION}: "
+            f"{got_type}: version {_short(got_version)}; this side speaks {kind.VERSION}: "
             "run the same release everywhere"
         )
-    return typing.cast(_M, _read_fields(fields, expected, name, Dims()))
+    return _read_fields(fields, kind, kind.__name__, Dims())
 
 
 def salvage(payload: bytes, expected: type[_M], names: tuple[str, ...]) -> dict[str, Any]:

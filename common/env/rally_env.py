@@ -35,7 +35,9 @@ class EnvConfig(BaseModel):
     control_rate_hz: Literal[50, 100, 200] = Field(
         50, description="control steps a second", json_schema_extra={"unit": "Hz"}
     )
-    noise: Literal["off", "standard", "hard"] = Field("standard", description="what differs from rally to rally")
+    noise: Literal["off", "standard", "hard"] = Field(
+        "standard", description="what differs from rally to rally"
+    )
     flight: Literal["simple", "full"] = Field("simple", description="aerodynamics of the ball")
     time_limit_s: float = Field(
         2.5, gt=0.1, le=60, description="longest rally; cut, not lost", json_schema_extra={"unit": "s"}
@@ -43,10 +45,16 @@ class EnvConfig(BaseModel):
     carry_over: float = Field(
         0.5, ge=0, le=1, description="share of episodes that begin as the last stroke left the robot"
     )
-    go_on: float = Field(0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally")
+    go_on: float = Field(
+        0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally"
+    )
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     reset_spread: float = Field(
-        0.1, ge=0, le=0.5, description="joints start at home plus up to this", json_schema_extra={"unit": "m, rad"}
+        0.1,
+        ge=0,
+        le=0.5,
+        description="joints start at home plus up to this",
+        json_schema_extra={"unit": "m, rad"},
     )
     reward: RewardConfig = RewardConfig()
 
@@ -99,9 +107,14 @@ class EnvStep:
 
 @kernel
 def _draw_robot(
-    seeds: npt.NDArray[np.uint64], noise: NoiseProfile, carry_over: float, spread: float, gains: Array, offset: Array
+    seeds: npt.NDArray[np.uint64],
+    noise: NoiseProfile,
+    carry_over: float,
+    spread: float,
+    gains: Array,
+    offset: Array,
 ) -> Flags:
-    """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds; return which robots stay as they are."""
+    """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds; return which robots stay put."""
     stay = np.empty(seeds.shape[0], np.bool_)
     low, high = noise.gain_factor
     for k in range(seeds.shape[0]):
@@ -252,6 +265,6 @@ class RallyEnv:
         if home.size:
             self.robot.go_home(home, offset[~stay & ~same_episode])
             self._rallies.last_action[home] = self.robot.home_action
-        longer = np.array([uniform(int(seed), _RESET, 1) < config.go_on for seed in launches.seeds], np.int64)
+        longer = np.array([uniform(seed, _RESET, 1) < config.go_on for seed in launches.seeds], np.int64)
         rounds = np.where(config.rounds > 1, config.rounds, 1 + longer)
         self._rallies.rounds_left[rows] = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)

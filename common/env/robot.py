@@ -19,7 +19,7 @@ MUJOCO_STEP_200_HZ = 0.0025  # [s] two substeps where the control period is 5 ms
 JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
 RACKET_BODY = "racket"
 
-# Published limits of the group's robot: 2 m/s rails, 11.64 rad/s yaw and pitch, 5.86 rad/s the last three joints.
+# Published limits of the group's robot: rails [m/s], yaw and pitch, the last three joints [rad/s]
 USST_SPEED_LIMITS = (2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86)
 
 
@@ -44,7 +44,9 @@ def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
     model = load_model(preset)
     limits = np.array(model.actuator_ctrlrange)
     middle = limits.mean(axis=1)
-    action: npt.NDArray[np.float32] = ((model.key("home").qpos - middle) / (limits[:, 1] - middle)).astype(np.float32)
+    action: npt.NDArray[np.float32] = ((model.key("home").qpos - middle) / (limits[:, 1] - middle)).astype(
+        np.float32
+    )
     return action
 
 
@@ -69,7 +71,11 @@ class RobotBatch:
     ) -> None:
         period = 1.0 / control_rate_hz
         if step is None:
-            step = MUJOCO_STEP if abs(period / MUJOCO_STEP - round(period / MUJOCO_STEP)) < 1e-9 else MUJOCO_STEP_200_HZ
+            step = (
+                MUJOCO_STEP
+                if abs(period / MUJOCO_STEP - round(period / MUJOCO_STEP)) < 1e-9
+                else MUJOCO_STEP_200_HZ
+            )
         self.substeps = round(period / step)
         if abs(self.substeps * step - period) > 1e-9:
             raise ValueError(f"control period {period} s is not a multiple of the MuJoCo step {step} s")
@@ -110,7 +116,7 @@ class RobotBatch:
         self._held[rows] = self.home
 
     def set_gains(self, rows: npt.NDArray[np.int64], factors: Array, action_latency: Array) -> None:
-        """Give robots ``rows`` their own drives: factors of kp, kv, damping (n, 3, 7) and latency [s] (n,)."""
+        """Give robots ``rows`` their drives: factors of kp, kv, damping (n, 3, 7) and latency [s] (n,)."""
         kp = self._kp * factors[:, 0]
         self._gain[rows, :, 0] = kp
         self._bias[rows, :, 1] = -kp

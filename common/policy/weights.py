@@ -22,6 +22,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from common.errors import ReportedError
 from common.policy.actor_critic import ActorCritic, NetworkConfig
 from common.policy.normalizer import Moments, normalize
 from common.rally.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, Part
@@ -30,7 +31,7 @@ WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
 
 
-class PolicyError(ValueError):
+class PolicyError(ReportedError, ValueError):
     """A policy that can't be read or doesn't fit: one line that names what was got and what is allowed."""
 
 

@@ -1,7 +1,7 @@
 """Random numbers by counter: every draw is a pure function of (seed, stream, counter).
 
-A rally's randomness hangs on its own seed and on nothing else: not on the batch it is played in, not on what was
-drawn before. So batch equals loop, and a replay meets the same table, rubber, camera noise and latency.
+A rally's randomness hangs on its own seed and on nothing else: not on the batch it is played in, not on what
+was drawn before. So batch equals loop, and a replay meets the same table, rubber, camera noise and latency.
 The mixer is SplitMix64 (Steele, Lea, Flood 2014, "Fast splittable pseudorandom number generators").
 """
 
@@ -11,6 +11,8 @@ from enum import IntEnum
 import numpy as np
 
 from common.jit import kernel
+
+Bits = int | np.uint64
 
 
 class Stream(IntEnum):
@@ -34,8 +36,8 @@ _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(
 
 
 @kernel
-def mix(z: int) -> int:
-    """Return 64 well-mixed bits of ``z`` (uint64 in, uint64 out; a bijection)."""
+def mix(z: Bits) -> np.uint64:
+    """Return 64 well-mixed bits of ``z`` (a bijection)."""
     z = np.uint64(z)
     z = (z ^ (z >> _S30)) * _MIX_1
     z = (z ^ (z >> _S27)) * _MIX_2
@@ -43,26 +45,26 @@ def mix(z: int) -> int:
 
 
 @kernel
-def bits(seed: int, stream: int, counter: int) -> int:
-    """Return 64 random bits (uint64)."""
+def bits(seed: Bits, stream: int, counter: int) -> np.uint64:
+    """Return 64 random bits."""
     return mix(mix(np.uint64(seed) + np.uint64(stream) * _GAMMA) + np.uint64(counter) * _GAMMA)
 
 
 @kernel
-def uniform(seed: int, stream: int, counter: int) -> float:
+def uniform(seed: Bits, stream: int, counter: int) -> float:
     """Return a float in [0, 1)."""
     return float(bits(seed, stream, counter) >> _S11) * 1.1102230246251565e-16
 
 
 @kernel
-def between(low: float, high: float, seed: int, stream: int, counter: int) -> float:
+def between(low: float, high: float, seed: Bits, stream: int, counter: int) -> float:
     """Return a float, uniform in [low, high)."""
     return low + (high - low) * uniform(seed, stream, counter)
 
 
 @kernel
-def normal_pair(seed: int, stream: int, counter: int) -> tuple[float, float]:
-    """Return two independent standard normal floats (Box-Muller); uses counters 2k and 2k + 1 of the stream."""
+def normal_pair(seed: Bits, stream: int, counter: int) -> tuple[float, float]:
+    """Return two independent standard normal floats (Box-Muller); uses counters 2k and 2k + 1."""
     radius = math.sqrt(-2.0 * math.log(1.0 - uniform(seed, stream, 2 * counter)))
     angle = 2.0 * math.pi * uniform(seed, stream, 2 * counter + 1)
     return radius * math.cos(angle), radius * math.sin(angle)

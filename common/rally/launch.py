@@ -1,7 +1,7 @@
 """Launches: how one is drawn from its seed, and blocks of those that make a valid rally.
 
 A rally is valid if it crosses the net untouched and its first touch of anything is the robot's court.
-Everything random about a rally - launch, air, target, and at use table and rubber - is drawn from its own
+Everything random about a rally - launch and air, and at use target, table and rubber - is drawn from its own
 64-bit seed by counter (``draws.py``): no generator state to keep or to lose. So a block of valid rallies is a
 function of its arguments, and any launch can be drawn again from preset, noise profile and seed.
 """
@@ -20,7 +20,8 @@ from common.physics.flight import SIMPLE
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.vec import Vec, cross
 from common.rally.draws import Stream, between, bits, normal_pair, uniform
-from common.rally.launch_presets import AIR_FACTORS, LEVELS, PRESETS, AirFactors, Curve, Preset
+from common.rally.launch_presets import LEVELS, PRESETS, Curve, Preset
+from common.rally.noise import PROFILES, NoiseProfile
 
 Array = npt.NDArray[np.float64]
 Seeds = npt.NDArray[np.uint64]
@@ -45,10 +46,6 @@ class Purpose(IntEnum):
     FALLBACK = 2  # launches nobody validated, for an empty buffer
 
 
-TARGET_X: Final = (0.1, 1.35)  # m
-TARGET_Y: Final = (-0.7425, 0.7425)  # m; the court less the ball's radius
-
-
 @dataclass(frozen=True, slots=True)
 class RallyBlock:
     """Rallies as they were drawn.
@@ -62,15 +59,6 @@ class RallyBlock:
     launches: Array
     seeds: Seeds
     drawn: int
-
-
-@kernel
-def target(seed: int) -> tuple[float, float]:
-    """Return where on the opponent's court this rally's ball shall land: x, y [m]."""
-    return (
-        between(TARGET_X[0], TARGET_X[1], seed, Stream.TARGET, 0),
-        between(TARGET_Y[0], TARGET_Y[1], seed, Stream.TARGET, 1),
-    )
 
 
 @kernel
@@ -135,7 +123,7 @@ def _stroke(preset: Preset, seed: int) -> tuple[Vec, Vec]:
 
 
 @kernel
-def launch(preset: Preset, air: AirFactors, seed: int) -> tuple[Vec, Vec, Vec, float, float]:
+def launch(preset: Preset, noise: NoiseProfile, seed: int) -> tuple[Vec, Vec, Vec, float, float]:
     """Return position, velocity, spin, drag and lift factor of the launch with this seed, valid or not."""
     position = _drawn(preset.position, seed, 0)
     if preset.polar:
@@ -143,8 +131,8 @@ def launch(preset: Preset, air: AirFactors, seed: int) -> tuple[Vec, Vec, Vec, f
     else:
         velocity = _drawn(preset.velocity, seed, 3)
         spin = _ball_spin(preset.spin_radius, seed, 6)
-    drag_factor = between(air.drag[0], air.drag[1], seed, Stream.LAUNCH, 9)
-    lift_factor = between(air.lift[0], air.lift[1], seed, Stream.LAUNCH, 10)
+    drag_factor = between(noise.drag_factor[0], noise.drag_factor[1], seed, Stream.LAUNCH, 9)
+    lift_factor = between(noise.lift_factor[0], noise.lift_factor[1], seed, Stream.LAUNCH, 10)
     return position, velocity, spin, drag_factor, lift_factor
 
 
@@ -170,7 +158,7 @@ def is_valid(
 @kernel
 def _fill(
     preset: Preset,
-    air: AirFactors,
+    noise: NoiseProfile,
     seed: int,
     shard: int,
     block: int,
@@ -190,7 +178,7 @@ def _fill(
         seeds[filled] = (bits(key, purpose, drawn) >> np.uint64(2)) | (np.uint64(purpose) << np.uint64(62))
         rally = seeds[filled]
         drawn += 1
-        position, velocity, spin, drag_factor, lift_factor = launch(preset, air, rally)
+        position, velocity, spin, drag_factor, lift_factor = launch(preset, noise, rally)
         if valid_only and not is_valid(position, velocity, spin, drag_factor, lift_factor, model, no_robot):
             continue
         for k in range(3):
@@ -224,8 +212,8 @@ def draw_rallies(
         shard: Which of the run's streams of blocks.
         block: Index in that stream. One seed's blocks share no rally.
         preset: A key of ``PRESETS``.
-        noise: A key of ``AIR_FACTORS``: how far drag and lift are drawn from nominal. The launches behind two
-            profiles are the same up to what the air makes invalid.
+        noise: A key of ``noise.PROFILES``: how far drag and lift are drawn from nominal. The launches behind
+            two profiles are the same up to what the air makes invalid.
         purpose: Rallies of different purposes never share a seed.
         model: ``flight.SIMPLE`` or ``flight.FULL``.
     """
@@ -234,7 +222,7 @@ def draw_rallies(
     most = math.ceil(n / FEWEST_VALID)
     filled, drawn = _fill(
         PRESETS[preset],
-        AIR_FACTORS[noise],
+        PROFILES[noise],
         # a NumPy scalar: half of all seeds are too big for the int64 that numba makes of a Python int
         np.array([seed], np.uint64)[0],
         shard,

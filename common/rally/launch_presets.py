@@ -1,4 +1,4 @@
-"""The launch presets, and how far the air varies in each noise profile: one literal table each."""
+"""The launch presets, one literal table; how far the air varies stands in ``noise.PROFILES``."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -62,21 +62,5 @@ PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
             spin_radius=0.0,
             topspin_by_speed=0.75,
         ),
-    }
-)
-
-
-class AirFactors(NamedTuple):
-    """Ranges of the two factors of the air in one noise profile, drawn per rally."""
-
-    drag: tuple[float, float]  # [-]
-    lift: tuple[float, float]  # [-]
-
-
-AIR_FACTORS: Final[Mapping[str, AirFactors]] = MappingProxyType(
-    {
-        "off": AirFactors((1.0, 1.0), (1.0, 1.0)),
-        "standard": AirFactors((0.85, 1.15), (0.80, 1.20)),
-        "hard": AirFactors((0.70, 1.30), (0.60, 1.40)),
     }
 )

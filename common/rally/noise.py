@@ -1,4 +1,4 @@
-"""What differs from rally to rally: one literal table of noise profiles, and how a rally's conditions are drawn."""
+"""What differs from rally to rally: one literal table of noise profiles, and how conditions are drawn."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -119,24 +119,25 @@ TARGET_X: Range = (0.10, 1.35)  # [m] where targets lie on the opponent's court
 TARGET_Y: Range = (-0.7425, 0.7425)  # [m]
 MAX_LATENCY_STEPS = 8  # [grid steps] 40 ms: how far back the camera ring must reach
 
-_TARGET, _TABLE, _RUBBER_STREAM = int(Stream.TARGET), int(Stream.TABLE), int(Stream.RUBBER)
+_TARGET, _TABLE, _RACKET = int(Stream.TARGET), int(Stream.TABLE), int(Stream.RUBBER)
 _LATENCY, _BURST = int(Stream.LATENCY), int(Stream.BURST)
-_C_TABLE, _C_RACKET, _C_TARGET = Condition.TABLE_RESTITUTION0, Condition.RACKET_RESTITUTION0, Condition.TARGET_X
 
 
 @kernel
-def draw_conditions(seed: int, drag_factor: float, lift_factor: float, noise: NoiseProfile, out: Array) -> None:
+def draw_conditions(
+    seed: int, drag_factor: float, lift_factor: float, noise: NoiseProfile, out: Array
+) -> None:
     """Write a rally's conditions into ``out`` (14,), a pure function of its seed.
 
-    The target and the table, unlike the launch, act after validity is decided: they aren't kept with the rally.
+    Target, table and racket act after validity is decided: unlike the launch they aren't kept with the rally.
     """
     out[0], out[1] = drag_factor, lift_factor
     out[2] = between(noise.table_restitution0[0], noise.table_restitution0[1], seed, _TABLE, 0)
     out[3] = between(noise.table_friction[0], noise.table_friction[1], seed, _TABLE, 1)
-    out[4] = between(noise.racket_restitution0[0], noise.racket_restitution0[1], seed, _RUBBER_STREAM, 0)
-    out[5] = between(noise.racket_restitution_slope[0], noise.racket_restitution_slope[1], seed, _RUBBER_STREAM, 1)
-    out[6] = between(noise.racket_alpha[0], noise.racket_alpha[1], seed, _RUBBER_STREAM, 2)
-    out[7] = between(noise.racket_spin_loss[0], noise.racket_spin_loss[1], seed, _RUBBER_STREAM, 3)
+    out[4] = between(noise.racket_restitution0[0], noise.racket_restitution0[1], seed, _RACKET, 0)
+    out[5] = between(noise.racket_restitution_slope[0], noise.racket_restitution_slope[1], seed, _RACKET, 1)
+    out[6] = between(noise.racket_alpha[0], noise.racket_alpha[1], seed, _RACKET, 2)
+    out[7] = between(noise.racket_spin_loss[0], noise.racket_spin_loss[1], seed, _RACKET, 3)
     out[8] = between(TARGET_X[0], TARGET_X[1], seed, _TARGET, 0)
     out[9] = between(TARGET_Y[0], TARGET_Y[1], seed, _TARGET, 1)
     late = between(noise.observation_latency[0], noise.observation_latency[1], seed, _LATENCY, 0)

@@ -25,13 +25,13 @@ OBSERVATION: tuple[Part, ...] = (
     Part("ball_pos", 3, "m", -4.0, 4.0, "ball as perceived: late, noisy, sometimes held"),
     Part("ball_vel", 3, "m/s", -40.0, 40.0, "ball's velocity as perceived"),
     Part("target", 2, "m", -0.7425, 1.35, "where to land: x, y on the opponent's court"),
-    Part("trajectory_state", 1, "-", -1.0, 1.0, "2s/3 - 1, s = 0 before the bounce, 1 after it, 2 after the racket, 3 landed"),
+    Part("trajectory_state", 1, "-", -1.0, 1.0, "2s/3 - 1; s: 0 launched, 1 bounced, 2 hit, 3 landed"),
     Part("continuous_state", 4, "-", 0.0, 1.0, "one-hot over tau_01, tau_12, tau_23, tau_30"),
 )
 """The paper's observation, in its order (it prints "racket position (7)"; only 3 sums to 37)."""
 
 ACTION: tuple[Part, ...] = (
-    Part("joint_target", 7, "half-range", -1.0, 1.0, "absolute target of each joint: middle + a x half-range, tracked by PD"),
+    Part("joint_target", 7, "half-range", -1.0, 1.0, "each joint's absolute target: middle + a x half-range"),
 )
 
 

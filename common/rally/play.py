@@ -10,7 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from common.jit import kernel
-from common.physics.arm import joint_rates_at, joints_at, point_velocity, racket_motion, racket_pose, racket_quaternion, speed_bound
+from common.physics.arm import (
+    joint_rates_at,
+    joints_at,
+    point_velocity,
+    racket_motion,
+    racket_pose,
+    racket_quaternion,
+    speed_bound,
+)
 from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP
 from common.physics.fly import fly_step
 from common.physics.racket_bounce import racket_bounce
@@ -86,7 +94,7 @@ class Step(NamedTuple):
     reward: Array  # (B,)
     terms: Array  # (B, 8) reward.TERMS
     outcome: Integers  # (B,) trajectory.Outcome
-    impulse: Array  # (B, 6) impulse [N s] and angular impulse [N m s] of the ball on the racket, about its centre
+    impulse: Array  # (B, 6) [N s, N m s] impulse of the ball on the racket, and its moment about the centre
 
 
 def allocate(count: int) -> tuple[Rallies, Step]:
@@ -112,11 +120,12 @@ def allocate(count: int) -> tuple[Rallies, Step]:
 
 @kernel
 def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
-    """Update what the robot sees of ball b: the sample of a latency ago with noise, or the last one if it is lost."""
+    """Update what the robot sees of ball b: the sample of a latency ago with noise; if lost, the last one."""
     seed = rallies.seed[b]
     moment = rallies.clock[b] * GRID_STEP
     condition = rallies.condition[b]
-    if step > 0 and (uniform(seed, _CAMERA, 8 * step) < noise.loss or condition[12] <= moment < condition[13]):
+    in_burst = condition[12] <= moment < condition[13]
+    if step > 0 and (in_burst or uniform(seed, _CAMERA, 8 * step) < noise.loss):
         return
     row = (rallies.head[b] + RING - int(condition[10])) % RING
     seen = rallies.seen[b]
@@ -167,7 +176,14 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
 
 @kernel
 def _play_one(
-    rallies: Rallies, b: int, motion: Motion, actions: Array, rules: Rules, noise: NoiseProfile, path: Array, step: Step
+    rallies: Rallies,
+    b: int,
+    motion: Motion,
+    actions: Array,
+    rules: Rules,
+    noise: NoiseProfile,
+    path: Array,
+    step: Step,
 ) -> None:
     """Play ball b for one control step. ``path`` (n + 1, 7) is scratch for the robot's joints."""
     substeps = motion.joint_pos.shape[1]
@@ -191,15 +207,25 @@ def _play_one(
         for _ in range(_TOUCHES_A_STEP):
             start = grid_step * GRID_STEP + (GRID_STEP - rest)
             pos, vel, flown, what, normal = fly_step(
-                pos, vel, spin, rest, condition[0], condition[1], rules.flight_model, path, start, motion.step, fastest
+                pos,
+                vel,
+                spin,
+                rest,
+                condition[0],
+                condition[1],
+                rules.flight_model,
+                path,
+                start,
+                motion.step,
+                fastest,
             )
             rest -= flown
-            if (state == _TAU_2 or state == _TAU_23) and pos[0] > BALL_RADIUS:
+            if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:
                 rallies.over[b] = True
             if what == NONE:
                 break
             following = rules.transitions[state, what]
-            if what == ROBOT_COURT or what == OPPONENT_COURT:
+            if what in (ROBOT_COURT, OPPONENT_COURT):
                 vel, spin = table_bounce(vel, spin, normal, condition[2], condition[3])
             elif what == RACKET:
                 moment = start + flown
@@ -212,7 +238,15 @@ def _play_one(
                     continue  # a graze that is over as it begins: no contact without approach
                 before = vel
                 vel, spin = racket_bounce(
-                    vel, spin, normal, surface_vel, condition[4], condition[5], condition[6], condition[7], np.inf
+                    vel,
+                    spin,
+                    normal,
+                    surface_vel,
+                    condition[4],
+                    condition[5],
+                    condition[6],
+                    condition[7],
+                    np.inf,
                 )
                 impulse = scale(BALL_MASS, sub(before, vel))
                 turn = cross(sub(contact, centre), impulse)
@@ -318,7 +352,7 @@ def launch_rallies(
 def observe(
     rallies: Rallies, rows: Integers, joint_pos: Array, joint_vel: Array, out: npt.NDArray[np.float32]
 ) -> None:
-    """Write the 37 numbers of ``observation.OBSERVATION`` for ``rows`` (n,) into the same rows of ``out`` (B, 37).
+    """Write ``observation.OBSERVATION`` of ``rows`` (n,) into the same rows of ``out`` (B, 37).
 
     Args:
         rallies: Rows to read.

@@ -1,7 +1,7 @@
 """The paper's reward: R, one literal table, and the penalty e_r.
 
-reward = one-hot(tau) R[stage] - e_r (the paper prints plus; all its coefficients are positive, so plus would pay
-for torque and jitter). Every entry of R is a sum of a constant and four features:
+reward = one-hot(tau) R[stage] - e_r (the paper prints plus; all its coefficients are positive, so plus would
+pay for torque and jitter). Every entry of R is a sum of a constant and four features:
 
     g        1/(1 + d_rb^2)^2, d_rb the distance of racket and ball [m]
     speed    x velocity of the racket's contact point just before contact, clipped to 0..10 m/s
@@ -21,16 +21,16 @@ _0 = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 # fmt: off
 R: dict[State, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {
-    #              stage 1: catch                 stage 2: hit                    stage 3: aim
+    #              stage 1: catch                 stage 2: hit                   stage 3: aim
     #              const   g   speed aim land
-    State.TAU_0:  (_0,                            _0,                             _0),
-    State.TAU_01: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),    (0.0,  0.1, 0.0, 0.0, 0.0)),
-    State.TAU_1:  ((10.0, 0.0, 0.0, 0.0, 0.0),    (4.0,  0.0,  0.0, 0.0, 0.0),    (1.0,  0.0, 0.0, 0.0, 0.0)),
-    State.TAU_12: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),    (0.0,  0.1, 0.0, 0.0, 0.0)),
-    State.TAU_2:  ((25.0, 0.0, 0.0, 0.0, 0.0),    (50.0, 0.0,  1.0, 0.0, 0.0),    (10.0, 0.0, 0.0, 0.0, 0.0)),
-    State.TAU_23: (_0,                            _0,                             (0.0,  0.0, 0.0, 1.0, 0.0)),
-    State.TAU_3:  (_0,                            _0,                             (30.0, 0.0, 0.0, 0.0, 40.0)),
-    State.TAU_30: (_0,                            _0,                             _0),
+    State.TAU_0:  (_0,                            _0,                            _0),
+    State.TAU_01: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),   (0.0,  0.1, 0.0, 0.0, 0.0)),
+    State.TAU_1:  ((10.0, 0.0, 0.0, 0.0, 0.0),    (4.0,  0.0,  0.0, 0.0, 0.0),   (1.0,  0.0, 0.0, 0.0, 0.0)),
+    State.TAU_12: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),   (0.0,  0.1, 0.0, 0.0, 0.0)),
+    State.TAU_2:  ((25.0, 0.0, 0.0, 0.0, 0.0),    (50.0, 0.0,  1.0, 0.0, 0.0),   (10.0, 0.0, 0.0, 0.0, 0.0)),
+    State.TAU_23: (_0,                            _0,                            (0.0,  0.0, 0.0, 1.0, 0.0)),
+    State.TAU_3:  (_0,                            _0,                            (30.0, 0.0, 0.0, 0.0, 40.0)),
+    State.TAU_30: (_0,                            _0,                            _0),
 }
 # fmt: on
 
@@ -44,13 +44,35 @@ class RewardConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     reference_rate_hz: float = Field(
-        50.0, gt=0, le=1000, description="rate at which continuous rows and e_r are paid unscaled", json_schema_extra={"unit": "Hz"}
+        50.0,
+        gt=0,
+        le=1000,
+        description="rate at which continuous rows and e_r are paid unscaled",
+        json_schema_extra={"unit": "Hz"},
     )
-    torque: float = Field(0.02, ge=0, le=10, description="c: weight of sum |T_i|/T_max,i", json_schema_extra={"unit": "-"})
-    jitter: float = Field(0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"})
-    collision: float = Field(0.1, ge=0, le=10, description="e: weight of sum min(F_c/50 N, 1)", json_schema_extra={"unit": "-"})
-    landing_scale: float = Field(1.0, gt=0, le=10, description="length scale s of the landing reward; the paper's is 1", json_schema_extra={"unit": "m"})
-    stage_2_landing: float = Field(0.0, ge=0, le=100, description="bonus for a legal landing in stage 2; the paper's is 0", json_schema_extra={"unit": "-"})
+    torque: float = Field(
+        0.02, ge=0, le=10, description="c: weight of sum |T_i|/T_max,i", json_schema_extra={"unit": "-"}
+    )
+    jitter: float = Field(
+        0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"}
+    )
+    collision: float = Field(
+        0.1, ge=0, le=10, description="e: weight of sum min(F_c/50 N, 1)", json_schema_extra={"unit": "-"}
+    )
+    landing_scale: float = Field(
+        1.0,
+        gt=0,
+        le=10,
+        description="length scale s of the landing reward; the paper's is 1",
+        json_schema_extra={"unit": "m"},
+    )
+    stage_2_landing: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="bonus for a legal landing in stage 2; the paper's is 0",
+        json_schema_extra={"unit": "-"},
+    )
 
 
 def reward_table(config: RewardConfig) -> npt.NDArray[np.float64]:

@@ -1,8 +1,9 @@
 """The rules of a rally as one table: which state a touch leads to, or which outcome ends it.
 
-States follow the ball (the paper, section III-A): tau_0 launch, tau_01 on its way to the robot, tau_1 bounce on the
-robot's court, tau_12 robot catching, tau_2 racket contact, tau_23 on its way back, tau_3 landing on the opponent's
-court, tau_30 opponent catching. tau_i is an instant and is paid in one control step; tau_ij goes on until a touch.
+States follow the ball (the paper, section III-A): tau_0 launch, tau_01 on its way to the robot, tau_1 bounce
+on the robot's court, tau_12 robot catching, tau_2 racket contact, tau_23 on its way back, tau_3 landing on
+the opponent's court, tau_30 opponent catching. tau_i is an instant and is paid in one control step; tau_ij
+goes on until a touch.
 """
 
 from enum import IntEnum
@@ -79,14 +80,16 @@ CONTINUES_AS: dict[State, State] = {
     State.TAU_3: State.TAU_30,
 }
 
-CAUGHT_OUTCOMES = frozenset({Outcome.RETURNED, Outcome.NET, Outcome.OUT, Outcome.OWN_COURT, Outcome.EDGE, Outcome.DOUBLE_HIT})
+CAUGHT_OUTCOMES = frozenset(
+    {Outcome.RETURNED, Outcome.NET, Outcome.OUT, Outcome.OWN_COURT, Outcome.EDGE, Outcome.DOUBLE_HIT}
+)
 """Outcomes that always follow a legal racket contact (BODY and TIME_OUT may or may not)."""
 
 OUTCOME_OFFSET = 100
 
 
 def transition_table() -> npt.NDArray[np.int64]:
-    """Return TRANSITIONS for the kernels: [state, touch] -> next state, or OUTCOME_OFFSET + outcome; (8, 9)."""
+    """Return TRANSITIONS for the kernels, (8, 9): [state, touch] -> state, or OUTCOME_OFFSET + outcome."""
     table = np.full((len(State), len(Touch)), -1, dtype=np.int64)
     for state in State:
         for touch, value in TRANSITIONS[CONTINUES_AS.get(state, state)].items():

@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import deque
 from dataclasses import replace
 from threading import Event
 
@@ -31,6 +32,7 @@ from services.actor.rally_buffer import RallyBuffer
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.05
+RALLY_BATCHES = 8  # that wait beside the ring until there is room for them
 REPORT_INTERVAL_S = 0.25  # without credits: no grant can be lost for longer
 ASK_AGAIN_S = 1.0  # for the policy
 LEARNER_ID = "0"
@@ -64,7 +66,9 @@ class ActorService:
         self._policies = transport.subscribe(keys.policy(), capacity=1)
         self._stages = transport.subscribe(keys.stage(), capacity=64)
         asks = config.rallies == "ask"
-        self._rallies = None if asks else transport.subscribe(keys.rally(self._shard), capacity=8)
+        self._rallies = None if asks else transport.subscribe(keys.rally(self._shard), capacity=RALLY_BATCHES)
+        self._batches: deque[RallyBatch] = deque(maxlen=RALLY_BATCHES)
+        self._born: float | None = None
         self._block = 0
         self._control = transport.serve(keys.ctl("actor", config.id), capacity=16)
         self._alive = transport.declare_alive(keys.alive("actor", config.id, incarnation))
@@ -98,7 +102,7 @@ class ActorService:
         self._take_verdicts(now)
         self._outbox = box.expired(self._outbox, now)
         self._send(now)
-        reason = self._idle_reason()
+        reason = self._idle_reason(now)
         if not reason:
             self._idle_since = None
             self.state = "playing"
@@ -129,7 +133,8 @@ class ActorService:
 
     # ---- what to do
 
-    def _idle_reason(self) -> str:
+    def _idle_reason(self, now: float) -> str:
+        self._born = now if self._born is None else self._born
         snapshot = self._player.snapshot
         if self._paused:
             return "a resume"
@@ -137,6 +142,10 @@ class ActorService:
             return "the last verdicts"
         if snapshot is None:
             return f"a policy from the learner on {self._keys.policy()}"
+        if self._frames == 0 and now - self._born < self._config.rally_wait_s and self._buffer.room > 0:
+            self._refill()  # begin with valid rallies in every environment
+            if self._buffer.room > 0:
+                return f"rallies of shard {self._shard} from a generator"
         return box.idle_reason(self._outbox, snapshot.generation, snapshot.version)
 
     def _play(self, now: float) -> None:
@@ -289,7 +298,9 @@ class ActorService:
             if (batch.preset, batch.noise) != (self._config.launch, self._config.env.noise):
                 self._refused("rally", f"{batch.preset}/{batch.noise} from generator {batch.source}")
                 continue
-            self._buffer.put(batch)
+            self._batches.append(batch)
+        while self._batches and len(self._batches[0].seeds) <= max(self._buffer.room, 1):
+            self._buffer.put(self._batches.popleft())
 
     def _ask_for_rallies(self) -> None:
         """Fetch the next block by index and wait for it: which rally is played when must not depend on timing."""

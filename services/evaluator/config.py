@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from common.env.rally_env import EnvConfig
+from common.policy.actor_critic import NetworkConfig
 from common.service_config import ServiceConfig
 
 
@@ -19,6 +20,7 @@ class EvaluatorConfig(ServiceConfig):
     envs: int = Field(250, ge=1, le=65536, description="environments played together")
     json_line: bool = Field(False, alias="json", description="print the measures as one JSON object, last line")
     env: EnvConfig = EnvConfig()
+    network: NetworkConfig = NetworkConfig()
     folder: str = Field("", description="run folder; empty: runs/RUN")
     interval_s: float = Field(
         45.0, gt=0, description="following: time between evaluations", json_schema_extra={"unit": "s"}

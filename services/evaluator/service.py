@@ -12,7 +12,6 @@ from common.comms.keys import Keys
 from common.comms.messages import Command, Control, ControlReply, PolicySnapshot, Status
 from common.comms.transport import Flow, Reply, Transport
 from common.metrics import Metrics
-from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
 from common.policy.weights import (
     ACTION_CONTRACT,
@@ -60,7 +59,6 @@ class EvaluatorService:
 
     Args:
         config: Settings.
-        network: Network's shape, as the learner's.
         transport: Connection to the hub.
         metrics: Where its numbers go.
         incarnation: Of this life.
@@ -70,14 +68,13 @@ class EvaluatorService:
     def __init__(
         self,
         config: EvaluatorConfig,
-        network: NetworkConfig,
         transport: Transport,
         metrics: Metrics,
         incarnation: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
-        self._network_config, self._network = network, new_network(network)
+        self._network = new_network(config.network)
         self._incarnation = incarnation
         self._keys = keys = Keys(config.run)
         self._policies = transport.subscribe(keys.policy(), capacity=1)
@@ -199,7 +196,7 @@ class EvaluatorService:
         return Contract(
             observation=OBSERVATION_CONTRACT,
             action=ACTION_CONTRACT,
-            network=self._network_config,
+            network=self._config.network,
             control_rate_hz=env.control_rate_hz,
             robot=env.robot,
             launch=self._config.launch,

@@ -16,6 +16,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from common.errors import ReportedError
 from common.policy.normalizer import Moments
 from common.policy.weights import PolicyError, load_state, state_tensors
 from services.learner.training import Progress, Training
@@ -28,7 +29,7 @@ _NETWORK, _ADAM = "network.", "adam."
 _MOMENTS = ("obs_moments", "value_moments")
 
 
-class CheckpointError(ValueError):
+class CheckpointError(ReportedError, ValueError):
     """A checkpoint that can't be resumed from: one line that names the file and what is wrong."""
 
 
@@ -39,7 +40,7 @@ class Extras:
     run: str
     generation: int
     stage_log: list[dict[str, Any]]
-    counters: dict[str, float]
+    memory: list[dict[str, Any]]  # what became of every rollout: ledger.Remembered
     trained_seconds: float  # since the first trained batch, through restarts
 
 

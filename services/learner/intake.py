@@ -30,7 +30,7 @@ class IntakeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    dataset_rollouts: int = Field(16, ge=1, description="rollouts of one dataset")
+    dataset_rollouts: int = Field(2, ge=1, description="rollouts of one dataset")
     max_lag: int = Field(
         2, ge=0, le=64, description="versions that a rollout may be behind; 0 is strictly synchronous"
     )
@@ -87,7 +87,7 @@ class Intake:
             standing=self._standing,
             is_known=known is not None,
             queued=len(self._queue),
-            queue_limit=self._config.queue_rollouts,
+            queue_limit=self._queue_limit(),
             version_at_use=self._version_at_use(),
             max_lag=self._config.max_lag,
         )
@@ -182,6 +182,14 @@ class Intake:
         account.last_heard = now
         return account
 
+    def _queue_limit(self) -> int:
+        """Return how many rollouts may wait: no more than this stage will train on.
+
+        One that came after the last dataset of a stage would be accepted only to be lost at the change.
+        """
+        datasets = self._standing.datasets_left - bool(self._in_update)
+        return max(0, min(self._config.queue_rollouts, datasets * self._config.dataset_rollouts))
+
     def _version_at_use(self) -> int:
         datasets_before = len(self._queue) // self._config.dataset_rollouts + bool(self._in_update)
         return self._standing.version + datasets_before
@@ -214,7 +222,8 @@ class Intake:
     def _wanted(self, now: float) -> int:
         """Return how many more rollouts of today's version would be used within the lag that is aimed at."""
         lag = min(self._config.target_lag, self._config.max_lag)
-        datasets = lag + 1 - bool(self._in_update)
+        # nothing is collected for after a stage change: it would be lost
+        datasets = min(lag + 1, self._standing.datasets_left) - bool(self._in_update)
         promised = sum(
             self._outstanding(account)
             for account in self._accounts.values()

@@ -10,9 +10,10 @@ repeated. What then remains missing is in flight, or lost once the actor is dead
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
+from typing import Any
 
 from common.comms.messages import ActorReport, VerdictKind
 
@@ -65,12 +66,24 @@ Span = tuple[int, int]  # half-open range of sequence numbers
 
 @dataclass(frozen=True, slots=True)
 class Remembered:
-    """One incarnation as a checkpoint keeps it: plain values that JSON can hold."""
+    """One incarnation as a checkpoint keeps it."""
 
     actor: str
     incarnation: int
     published: int
     outcomes: tuple[tuple[str, tuple[Span, ...]], ...]  # which sequence numbers ended how
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values that `from_json` reads."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Remembered":
+        """Return what `to_json` gave, after a detour through JSON."""
+        outcomes = tuple(
+            (name, tuple((first, end) for first, end in ranges)) for name, ranges in values["outcomes"]
+        )
+        return cls(values["actor"], values["incarnation"], values["published"], outcomes)
 
 
 class Account:

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version as package_version
 from threading import Event
@@ -15,6 +15,7 @@ from common.comms.messages import (
     Control,
     ControlReply,
     PolicySnapshot,
+    Rollout,
     StageChange,
     StageLog,
     Status,
@@ -29,7 +30,7 @@ from common.run_folder import RunFolder
 from services.learner import checkpoint
 from services.learner.config import LearnerConfig
 from services.learner.intake import Intake
-from services.learner.ledger import Ledger
+from services.learner.ledger import Ledger, Remembered
 from services.learner.record import Record, row
 from services.learner.training import EpochStats, Training
 from services.learner.verdicts import Standing, open_rollout
@@ -176,7 +177,7 @@ class LearnerService:
 
     # ---- training
 
-    def _train(self, rollouts: list) -> None:  # type: ignore[type-arg]  # rollouts as Intake keeps them
+    def _train(self, rollouts: Sequence[Rollout]) -> None:
         self.state = "training"
         started = self._clock()
         stats = self.training.run_epoch(rollouts, self._serve)
@@ -222,7 +223,7 @@ class LearnerService:
             datasets_left=self.training.datasets_left,
         )
 
-    def _restore(self) -> tuple[object, ...]:
+    def _restore(self) -> tuple[Remembered, ...]:
         files = checkpoint.checkpoints(self._folder.checkpoints)
         if not files:
             raise checkpoint.CheckpointError(
@@ -235,7 +236,7 @@ class LearnerService:
         self._clocks.resumed_seconds = extras.trained_seconds
         self._record.truncate(self.training.progress.epoch)
         log.info("resumed file=%s epoch=%d frames=%d", files[-1], self.training.progress.epoch, self.training.progress.frames)
-        return checkpoint.memory_of(extras)
+        return tuple(Remembered.from_json(values) for values in extras.memory)
 
     # ---- talking
 

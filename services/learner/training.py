@@ -112,6 +112,15 @@ class Training:
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
         self.progress = Progress(stage=curriculum.first_stage, learning_rate=ppo.learning_rate)
 
+    @property
+    def datasets_left(self) -> int:
+        """How many datasets the present stage still takes, the next one included; at least 1.
+
+        A gate may end stage 1 earlier: it speaks a dataset ahead, so that none is collected in vain.
+        """
+        lengths = (self.curriculum.stage_1, self.curriculum.stage_2, self.curriculum.stage_3)
+        return max(1, lengths[self.progress.stage - 1] - self.progress.epochs_in_stage)
+
     def run_epoch(self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None) -> EpochStats:
         """Train one epoch on ``rollouts`` and go on to the next version; their order decides the result's bits.
 

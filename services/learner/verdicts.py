@@ -22,6 +22,7 @@ class Standing:
     stage_number: int
     stage: int
     contract_hash: str
+    datasets_left: int = 2**31  # until the stage changes or training ends, with the one that is in its update
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import msgpack
 import pytest
@@ -6,7 +7,7 @@ import pytest
 from common.comms.codec import encode
 from common.comms.messages import VerdictKind
 from services.learner.intake import Intake, IntakeConfig
-from services.learner.ledger import Account, Fate, restored, spans
+from services.learner.ledger import Account, Fate, Remembered, restored, spans
 from services.learner.verdicts import RULES, open_rollout
 from tests.unit.comms.message_examples import make_rollout
 from tests.unit.comms.test_codec import sealed
@@ -146,6 +147,15 @@ def test_limits_add_up_to_what_is_wanted_and_the_window():
     assert limits == [3, 0, 0]
 
 
+def test_nothing_is_collected_for_after_a_stage_change():
+    standing = dataclasses.replace(STANDING, datasets_left=1)
+    intake = make_intake(standing=standing, dataset_rollouts=1, max_lag=2)
+
+    assert intake.arrive(make_header(0), ROLLOUT, 0.0).credit_limit == 0
+    intake.take_dataset()
+    assert intake.arrive(make_header(1), ROLLOUT, 0.0).credit_limit == 0
+
+
 def test_credits_of_the_silent_and_of_the_dead_go_to_others():
     intake = make_intake(dataset_rollouts=4, max_lag=0, window=2, credit_patience_s=30.0)
     intake.arrive(make_header(actor="silent"), ROLLOUT, now=0.0)
@@ -183,7 +193,8 @@ def test_a_checkpoint_remembers_every_outcome_and_what_was_queued_is_lost():
     intake.take_dataset()
     intake.finish_update(dataclasses.replace(STANDING, version=11))
 
-    again = Intake(IntakeConfig(), dataclasses.replace(STANDING, generation=2), intake.memory())
+    memory = [Remembered.from_json(json.loads(json.dumps(entry.to_json()))) for entry in intake.memory()]
+    again = Intake(IntakeConfig(), dataclasses.replace(STANDING, generation=2), memory)
 
     ledger = again.ledgers()["actor-0", 1]
     assert (ledger.published, ledger.trained, ledger.lost) == (7, 2, 4)

@@ -1,0 +1,51 @@
+# One command each; every one makes .venv itself when it has to.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+MINUTES ?=
+ACTORS ?= 2
+RUN ?=
+
+.PHONY: help install train play test test-fast check fix bench clean
+
+help:                     ## this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
+
+install: $(STAMP)         ## make .venv with everything in it, and compile the kernels
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/python -m common.compile_kernels
+	@touch $(STAMP)
+
+train: $(STAMP)           ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
+	$(BIN)/python -m deploy.local --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
+
+play: $(STAMP)            ## measure the newest run's policy on fresh rallies
+	$(BIN)/python -m services.evaluator --policy runs/latest/policy/latest --rallies 1000 --json
+
+test: $(STAMP)            ## all tests
+	$(BIN)/python -m pytest
+
+test-fast: $(STAMP)       ## unit and contract tests
+	$(BIN)/python -m pytest tests/unit tests/contract
+
+check: $(STAMP)           ## format, lint, types, layers
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+fix: $(STAMP)             ## format, and mend what ruff can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: $(STAMP)           ## all benchmarks
+	$(BIN)/python -m benchmarks.generator --json
+	$(BIN)/python -m benchmarks.env --json
+	$(BIN)/python -m benchmarks.system --json
+
+clean:                    ## remove the environment and caches, not the runs
+	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info

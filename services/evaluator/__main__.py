@@ -1,0 +1,71 @@
+"""Run the evaluator: `python -m services.evaluator`; with --policy it plays once and ends."""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from threading import Event
+
+from common.comms.zenoh_transport import open_zenoh
+from common.config import load
+from common.log import set_up_logging
+from common.metrics import Metrics
+from common.process import DONE, run_service
+from common.service_config import new_incarnation
+from common.policy.weights import load_policy
+from services.evaluator.config import EvaluatorConfig
+from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.measures import measures
+from services.evaluator.service import EvaluatorService
+
+PROG = "python -m services.evaluator"
+
+
+def main(stop: Event) -> int:
+    """Run the service until it is done or asked to stop; return the exit status."""
+    config = load(EvaluatorConfig, sys.argv[1:], prog=PROG, section="evaluator")
+    set_up_logging(config.log_level, f"evaluator/{config.id}")
+    if config.policy:
+        play_once(config)
+        return DONE
+    os.nice(config.niceness)
+    metrics = Metrics("evaluator", config.id)
+    metrics.serve(config.metrics_port, config.metrics_host)
+    try:
+        transport = open_zenoh(config, stop)
+        try:
+            EvaluatorService(config, transport, metrics, new_incarnation()).run(stop)
+        finally:
+            transport.close()
+    finally:
+        metrics.close()
+    return DONE
+
+
+def play_once(config: EvaluatorConfig) -> None:
+    """Play a policy from a folder and print the measures; the last line is JSON if asked for."""
+    started = time.monotonic()
+    policy = load_policy(Path(config.policy))
+    contract = policy.contract
+    env = config.env.model_copy(
+        update={
+            "noise": config.noise,
+            "rounds": config.rounds,
+            "control_rate_hz": contract.control_rate_hz,
+            "robot": contract.robot,
+        }
+    )
+    rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
+    found = measures(play_match(policy, rallies, env, config.envs))
+    about = {"launch": config.launch, "noise": config.noise, "rounds": config.rounds, "seed": config.seed}
+    about |= {"policy": config.policy, "seconds": round(time.monotonic() - started, 2)}
+    if config.json_line:
+        sys.stdout.write(json.dumps(found | about) + "\n")
+        return
+    for name, value in (found | about).items():
+        sys.stdout.write(f"{name:>24}  {value}\n")
+
+
+if __name__ == "__main__":
+    sys.exit(run_service(PROG, main))

@@ -1,0 +1,161 @@
+"""Scripted balls against a hand-moved racket, for the tests of rules, reward and noise.
+
+Without drag and lift a ball flies a parabola, so that where it meets what can be worked out on paper.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from common.physics.flight import SIMPLE
+from common.rally import play
+from common.rally.noise import PROFILES, NoiseProfile
+from common.rally.reward import RewardConfig, reward_table
+from common.rally.trajectory import Outcome, State, transition_table
+
+Array = npt.NDArray[np.float64]
+
+CONTROL_PERIOD = 0.020  # s
+SUBSTEPS = 5
+HOME = (0.0, 0.0, 0.0, 1.0, 1.0, 1.1, 0.0)
+"""The racket's face stands upright at x = -1.077, y = 0, z = 0.226 and looks at the opponent."""
+AWAY = (-0.75, -0.9, 0.0, -1.5, 0.0, 0.0, 0.0)
+"""The arm leans back from the far corner of its rails: nothing but the beam (z < 0.15) is near the table."""
+TORQUE_LIMIT = np.array([400.0, 300.0, 24.0, 24.0, 12.0, 6.0, 3.0])
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What a scripted rally came to; rows are control steps."""
+
+    outcome: Outcome
+    states: list[State]  # at the end of each step
+    balls: Array  # (n, 9)
+    seen: Array  # (n, 7) the sample the robot goes by
+    terms: Array  # (n, 8) reward.TERMS
+    rewards: Array  # (n,)
+    impulses: Array  # (n, 6)
+    caught: bool
+    over: bool
+    landing_error: float
+
+
+def make_rules(
+    stage: int = 1, rate_scale: float = 1.0, time_limit: float = 2.5, reward: RewardConfig | None = None
+) -> play.Rules:
+    reward = reward or RewardConfig()
+    return play.Rules(
+        transitions=transition_table(),
+        rewards=np.ascontiguousarray(reward_table(reward)[stage - 1]),
+        landing_scale=reward.landing_scale,
+        rate_scale=rate_scale,
+        torque_weight=reward.torque,
+        torque_limit=TORQUE_LIMIT,
+        jitter_weight=reward.jitter,
+        collision_weight=reward.collision,
+        grid_steps=4,
+        time_limit=time_limit,
+        flight_model=SIMPLE,
+    )
+
+
+def make_motion(before: Sequence[float], after: Sequence[float]) -> play.Motion:
+    """Return one control step of a robot that moves evenly from one pose to another, without force or contact."""
+    share = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
+    start = np.array(before)
+    return play.Motion(
+        start_pos=start[None],
+        joint_pos=(start + share * (np.array(after) - start))[None],
+        torque=np.zeros((1, SUBSTEPS, 7)),
+        contact=np.zeros((1, SUBSTEPS, 4)),
+        step=CONTROL_PERIOD / SUBSTEPS,
+    )
+
+
+def make_record(
+    pos: Sequence[float],
+    vel: Sequence[float],
+    spin: Sequence[float] = (0.0, 0.0, 0.0),
+    drag: float = 0.0,
+    lift: float = 0.0,
+) -> Array:
+    return np.array([*pos, *vel, *spin, drag, lift])
+
+
+def begin(
+    record: Array,
+    state: State = State.TAU_01,
+    target: tuple[float, float] | None = None,
+    seed: int = 1,
+    noise: NoiseProfile = PROFILES["off"],
+) -> tuple[play.Rallies, play.Step]:
+    """Return one rally in play, in ``state``."""
+    rallies, step = play.allocate(1)
+    play.launch_rallies(rallies, np.array([0]), record[None], np.array([seed], np.uint64), noise)
+    rallies.state[0] = state
+    if target is not None:
+        rallies.condition[0, 8:10] = target
+    return rallies, step
+
+
+def play_ball(
+    pos: Sequence[float],
+    vel: Sequence[float],
+    spin: Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    state: State = State.TAU_01,
+    joints: Sequence[float] = AWAY,
+    rates: Sequence[float] = (0.0,) * 7,
+    drag: float = 0.0,
+    lift: float = 0.0,
+    target: tuple[float, float] | None = None,
+    rules: play.Rules | None = None,
+    seed: int = 1,
+    noise: NoiseProfile = PROFILES["off"],
+    steps: int = 150,
+) -> Played:
+    """Play a ball until its rally ends, for at most ``steps`` control steps.
+
+    Args:
+        pos: Ball's position [m].
+        vel: Ball's velocity [m/s].
+        spin: Ball's spin [rad/s].
+        state: The rally's state at the beginning.
+        joints: Joint positions at the beginning.
+        rates: Joint velocities, constant.
+        drag: Drag factor [-].
+        lift: Lift factor [-].
+        target: Where to land [m]; None: as the seed has it.
+        rules: ``make_rules()`` by default.
+        seed: Of the rally.
+        noise: Profile.
+        steps: Longest play.
+    """
+    rules = rules or make_rules()
+    rallies, step = begin(make_record(pos, vel, spin, drag, lift), state, target, seed, noise)
+    states, balls, seen, terms, rewards, impulses = [], [], [], [], [], []
+    for k in range(steps):
+        before, after = (np.array(joints) + t * CONTROL_PERIOD * np.array(rates) for t in (k, k + 1))
+        play.play_step(rallies, make_motion(before, after), np.zeros((1, 7)), rules, noise, step)
+        states.append(State(int(rallies.state[0])))
+        balls.append(rallies.ball[0].copy())
+        seen.append(rallies.seen[0].copy())
+        terms.append(step.terms[0].copy())
+        rewards.append(step.reward[0])
+        impulses.append(step.impulse[0].copy())
+        if step.outcome[0]:
+            break
+    return Played(
+        outcome=Outcome(int(step.outcome[0])),
+        states=states,
+        balls=np.array(balls),
+        seen=np.array(seen),
+        terms=np.array(terms),
+        rewards=np.array(rewards),
+        impulses=np.array(impulses),
+        caught=bool(rallies.caught[0]),
+        over=bool(rallies.over[0]),
+        landing_error=float(rallies.landing_error[0]),
+    )
