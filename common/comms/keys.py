@@ -4,7 +4,7 @@ topspin/v1/<run>/policy                          latest policy: put as a hint, l
 topspin/v1/<run>/stage                           stage changes: put as a hint, the log is asked for
 topspin/v1/<run>/rollout                         rollouts: requests to the learner, the verdict is the reply
 topspin/v1/<run>/rally/<shard>                   valid rallies: put in batches, or asked for by index
-topspin/v1/<run>/ctl/<role>/<id>                 requests to one service: pause, resume, drain, stop, bye
+topspin/v1/<run>/ctl/<role>/<id>                 commands to one service; actors' reports to the learner
 topspin/v1/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
 topspin/v1/<run>/status/<role>/<id>              heartbeats with cumulative counters
 """
@@ -57,10 +57,6 @@ class Keys:
     def rally(self, shard: int) -> str:
         """Return the key of the valid rallies of one shard (0, 1, ...)."""
         return f"{PREFIX}/{self.run}/rally/{_number('shard', shard)}"
-
-    def every_rally(self) -> str:
-        """Return the expression that matches the rallies of all shards."""
-        return f"{PREFIX}/{self.run}/rally/*"
 
     def ctl(self, role: str, id_: str) -> str:
         """Return the key of requests to one service."""

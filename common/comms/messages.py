@@ -23,6 +23,8 @@ U64 = npt.NDArray[np.uint64]
 I32 = npt.NDArray[np.int32]
 
 Count = Annotated[int, Wire("1", low=0, high=2**62)]
+# Of an actor's incarnation. The learner remembers each: a wild one must not cost it its memory.
+Sequence = Annotated[int, Wire("1", low=0, high=4_000_000)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
 Numbers = Annotated[Mapping[str, float], Wire("by name")]
@@ -139,7 +141,7 @@ class Rollout:
     stage_number: Count
     actor: str
     incarnation: Count
-    sequence: Count  # of this incarnation, from 0 without a gap
+    sequence: Sequence  # from 0 without a gap
     contract_hash: str
     obs: Annotated[F32, Wire("as the observation", "<f4", "T B D")]  # raw: the learner normalises
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
@@ -223,7 +225,7 @@ class Refusal:
 
     VERSION: ClassVar[int] = 1
 
-    sequence: Count
+    sequence: Sequence
     kind: VerdictKind
     generation: Count  # of the learner that said so
 
@@ -242,7 +244,7 @@ class ActorReport:
     actor: str
     incarnation: Count
     version: Count  # of the policy that it holds
-    published: Count  # sequence numbers used so far
+    published: Sequence  # numbers used so far
     in_flight: tuple[int, ...]
     dropped: tuple[int, ...]  # given up
     generation: Count  # of the learner that the actor heard last; 0 is none
@@ -263,18 +265,6 @@ class Status:
     state: str
     counters: Numbers
     gauges: Numbers
-
-
-@dataclass(frozen=True, slots=True)
-class Bye:
-    """A service leaves of its own will: tells a departure from a crash. The reply is a `ControlReply`."""
-
-    VERSION: ClassVar[int] = 1
-
-    role: str
-    id: str
-    incarnation: Count
-    counters: Numbers
 
 
 class Command(StrEnum):
@@ -317,7 +307,6 @@ MESSAGES: tuple[type[Any], ...] = (
     Verdict,
     ActorReport,
     Status,
-    Bye,
     Control,
     ControlReply,
 )

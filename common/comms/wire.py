@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import typing
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
@@ -66,11 +65,6 @@ def _declared_slots(kind: type) -> tuple[Slot, ...]:
         kind_of_field = hint.__origin__ if hasattr(hint, "__metadata__") else hint
         slots.append(Slot(field.name, kind_of_field, wire or Wire(), has_default))
     return tuple(slots)
-
-
-def fields_of(kind: type) -> Mapping[str, Wire]:
-    """Return what each field of a message type declares, by name: for documentation and tests."""
-    return {slot.name: slot.wire for slot in slots_of(kind)}
 
 
 class Dims:

@@ -8,9 +8,9 @@ Every value is there because its default lost or froze something in measurements
 * a short lease, so that a hung process is noticed; a receive buffer that doubles the throughput at 1 MB.
 """
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class ZenohConfig(BaseModel):
@@ -21,7 +21,7 @@ class ZenohConfig(BaseModel):
     mode: Literal["hub", "client"] = Field("client", description="listen at the endpoint, or connect to it")
     endpoint: str = Field(
         "tcp/127.0.0.1:7447",
-        pattern=r"^(tcp|tls|quic|unixsock-stream)/.+",
+        pattern=r"^(tcp|tls|unixsock-stream)/.+",
         description="where the hub listens",
     )
     peers: tuple[str, ...] = Field((), description="endpoints of other routers that a hub connects to")
@@ -41,6 +41,16 @@ class ZenohConfig(BaseModel):
     tls_ca: str = Field("", description="file with the authority's certificate; given = mutual TLS")
     tls_certificate: str = Field("", description="file with our certificate")
     tls_key: str = Field("", description="file with our private key")
+
+    @model_validator(mode="after")
+    def _tls_is_whole(self) -> Self:
+        files = (self.tls_ca, self.tls_certificate, self.tls_key)
+        if self.endpoint.startswith("tls/") != any(files) or any(files) != all(files):
+            raise ValueError(
+                f"endpoint {self.endpoint} with tls_ca, tls_certificate, tls_key = {files}; "
+                "allowed: all three with tls/..., none without"
+            )
+        return self
 
 
 def session_settings(config: ZenohConfig, attempt_s: float) -> dict[str, Any]:

@@ -61,18 +61,16 @@ class _Service:
     """How Zenoh treats one flow."""
 
     priority: zenoh.Priority
-    congestion: zenoh.CongestionControl
-    express: bool = False
+    express: bool = False  # sent at once, not batched with what follows
 
 
-# DROP wherever one hung receiver would stall the others; BLOCK only towards the one server of a request.
 _SERVICES: Final = {
-    Flow.POLICY: _Service(zenoh.Priority.DATA_HIGH, zenoh.CongestionControl.DROP),
-    Flow.STAGE: _Service(zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP, express=True),
-    Flow.ROLLOUT: _Service(zenoh.Priority.DATA, zenoh.CongestionControl.BLOCK),
-    Flow.RALLY: _Service(zenoh.Priority.DATA_LOW, zenoh.CongestionControl.DROP),
-    Flow.CONTROL: _Service(zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.BLOCK, express=True),
-    Flow.STATUS: _Service(zenoh.Priority.BACKGROUND, zenoh.CongestionControl.DROP),
+    Flow.POLICY: _Service(zenoh.Priority.DATA_HIGH),
+    Flow.STAGE: _Service(zenoh.Priority.INTERACTIVE_HIGH, express=True),
+    Flow.ROLLOUT: _Service(zenoh.Priority.DATA),
+    Flow.RALLY: _Service(zenoh.Priority.DATA_LOW),
+    Flow.CONTROL: _Service(zenoh.Priority.INTERACTIVE_HIGH, express=True),
+    Flow.STATUS: _Service(zenoh.Priority.BACKGROUND),
 }
 
 
@@ -95,7 +93,9 @@ def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "Zen
     while True:
         now = time.monotonic()
         left = started + config.connect_timeout_s - now
-        if left <= 0 or (stop is not None and stop.is_set()):
+        if stop is not None and stop.is_set():
+            raise TransportError(f"asked to stop while waiting for the hub at {config.endpoint}")
+        if left <= 0:
             raise TransportError(
                 f"no hub answered at {config.endpoint} in {now - started:.0f} s: "
                 "start the learner (python -m services.learner) or correct the endpoint"
@@ -208,7 +208,8 @@ class ZenohTransport:
                 target=zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
-                congestion_control=service.congestion,
+                # BLOCK: one asker, one server, an answer each; the reply inherits it
+                congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=service.priority,
                 express=service.express,
                 payload=payload,
@@ -256,7 +257,8 @@ class ZenohTransport:
             service = _SERVICES[flow]
             self._publishers[key, flow] = self._session.declare_publisher(
                 key,
-                congestion_control=service.congestion,
+                # with BLOCK, one hung subscriber would hold up the publisher and with it all others
+                congestion_control=zenoh.CongestionControl.DROP,
                 priority=service.priority,
                 express=service.express,
             )

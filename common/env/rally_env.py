@@ -113,17 +113,22 @@ def _draw_robot(
     spread: float,
     gains: Array,
     offset: Array,
-) -> Flags:
-    """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds; return which robots stay put."""
-    stay = np.empty(seeds.shape[0], np.bool_)
+) -> tuple[Flags, Array]:
+    """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds.
+
+    Returns:
+        Which robots stay as they are (n,), and a number in [0, 1) that decides who goes on over a return (n,).
+    """
+    stay, go_on = np.empty(seeds.shape[0], np.bool_), np.empty(seeds.shape[0])
     low, high = noise.gain_factor
     for k in range(seeds.shape[0]):
         stay[k] = uniform(seeds[k], _RESET, 0) < carry_over
+        go_on[k] = uniform(seeds[k], _RESET, 1)
         for j in range(7):
             offset[k, j] = between(-spread, spread, seeds[k], _RESET, 2 + j)
             for g in range(3):
                 gains[k, g, j] = between(low, high, seeds[k], _GAINS, 7 * g + j)
-    return stay
+    return stay, go_on
 
 
 class RallyEnv:
@@ -188,6 +193,7 @@ class RallyEnv:
 
     def reset(self) -> Floats:
         """Start every environment anew, robots at home; return the first observations (B, 37)."""
+        self._started = False
         self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
         self._rallies.last_action[:] = self.robot.home_action
         self._begin(self._all, np.zeros(self.count, np.bool_))
@@ -199,10 +205,16 @@ class RallyEnv:
         """Play one control step with ``actions`` (B, 7); values beyond [-1, 1] are clipped."""
         if not self._started:
             raise RuntimeError("step() before reset(): call reset() first")
-        clipped = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+        clipped: Array = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
         if clipped.shape != (self.count, ACTION_SIZE):
             raise ValueError(f"actions of shape {clipped.shape}: allowed is {(self.count, ACTION_SIZE)}")
+        if not np.isfinite(clipped).all():
+            raise ValueError(
+                f"actions of rows {np.flatnonzero(~np.isfinite(clipped).all(axis=1))} aren't finite"
+            )
         motion = self.robot.step(clipped)
+        # The rally goes on with the robot at home, but says nothing about the policy.
+        self._validated[self.robot.faulty] = False
         play.play_step(self._rallies, motion, clipped, self._rules, self.noise, self._step)
         self.robot.push_racket(self._step.impulse)
         self._returns += self._step.reward
@@ -229,7 +241,7 @@ class RallyEnv:
             truncated=truncated,
             ended=ended,
             final_obs=final_obs,
-            terms=self._step.terms,
+            terms=self._step.terms.copy(),
             finished=finished,
         )
 
@@ -257,14 +269,14 @@ class RallyEnv:
         self._lengths[rows] = 0
         gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
         config = self.config
-        stay = _draw_robot(launches.seeds, self.noise, config.carry_over, config.reset_spread, gains, offset)
+        stay, go_on = _draw_robot(
+            launches.seeds, self.noise, config.carry_over, config.reset_spread, gains, offset
+        )
         self.robot.set_gains(rows, gains, self._rallies.condition[rows, Condition.ACTION_LATENCY])
-        # A fault must not outlive its episode: a robot that MuJoCo blew up goes home, whatever was drawn.
-        stay &= np.isfinite(self.robot.joint_vel[rows]).all(axis=1) & self._started
-        home = rows[~stay & ~same_episode]
+        leaves = ~(stay & self._started) & ~same_episode
+        home = rows[leaves]
         if home.size:
-            self.robot.go_home(home, offset[~stay & ~same_episode])
+            self.robot.go_home(home, offset[leaves])
             self._rallies.last_action[home] = self.robot.home_action
-        longer = np.array([uniform(seed, _RESET, 1) < config.go_on for seed in launches.seeds], np.int64)
-        rounds = np.where(config.rounds > 1, config.rounds, 1 + longer)
+        rounds = np.where(config.rounds > 1, config.rounds, 1 + (go_on < config.go_on))
         self._rallies.rounds_left[rows] = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)

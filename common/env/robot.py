@@ -1,5 +1,7 @@
 """B MuJoCo robots stepped together: targets in, joint records out, one Python call a control step."""
 
+import logging
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -10,7 +12,10 @@ from mujoco.batch import Batch
 
 from common.rally.play import Motion
 
+log = logging.getLogger(__name__)
+
 Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
 RobotPreset = Literal["rails", "usst"]
 
 MODEL_PATH = Path(__file__).with_name("robot.xml")
@@ -18,6 +23,7 @@ MUJOCO_STEP = 0.004  # [s] racket pose against 0.25 ms: tests/unit/env/test_robo
 MUJOCO_STEP_200_HZ = 0.0025  # [s] two substeps where the control period is 5 ms
 JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
 RACKET_BODY = "racket"
+MAX_ACTION_LATENCY = 0.020  # [s] how far back targets are kept: the latest of any noise profile
 
 # Published limits of the group's robot: rails [m/s], yaw and pitch, the last three joints [rad/s]
 USST_SPEED_LIMITS = (2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86)
@@ -101,7 +107,11 @@ class RobotBatch:
         self._gain: Array = self.batch.expand("actuator_gainprm")
         self._bias: Array = self.batch.expand("actuator_biasprm")
         self._damping: Array = self.batch.expand("dof_damping")
-        self._held: Array = np.tile(self.home, (count, 1))
+        self._time: Array = self.batch.bind("time")
+        self._clock = np.zeros(count)
+        self.faulty: Rows = np.zeros(0, np.int64)
+        # Targets of the control steps before this one, newest first: a latency may exceed a control period.
+        self._held: Array = np.tile(self.home, (math.ceil(MAX_ACTION_LATENCY / period - 1e-9), count, 1))
         self._late_substeps = np.zeros(count, np.int64)
         self._substep_index = np.arange(self.substeps)
         self._control = np.empty((count, self.substeps, 7))
@@ -109,13 +119,13 @@ class RobotBatch:
         self._records: dict[str, Array] = {}
         self.go_home(np.arange(count), np.zeros((count, 7)))
 
-    def go_home(self, rows: npt.NDArray[np.int64], offset: Array) -> None:
+    def go_home(self, rows: Rows, offset: Array) -> None:
         """Put robots ``rows`` at rest at home plus ``offset`` (n, 7) [m, rad]."""
         self.batch.reset(ids=rows, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self.joint_pos[rows] = self.home + offset
-        self._held[rows] = self.home
+        self._held[:, rows] = self.home
 
-    def set_gains(self, rows: npt.NDArray[np.int64], factors: Array, action_latency: Array) -> None:
+    def set_gains(self, rows: Rows, factors: Array, action_latency: Array) -> None:
         """Give robots ``rows`` their drives: factors of kp, kv, damping (n, 3, 7) and latency [s] (n,)."""
         kp = self._kp * factors[:, 0]
         self._gain[rows, :, 0] = kp
@@ -129,13 +139,19 @@ class RobotBatch:
         self._wrench[:, self._racket] = impulse * (1.0 / (self.substeps * self.step_s))
 
     def step(self, actions: Array) -> Motion:
-        """Return the motion of one control step under ``actions`` (B, 7) in [-1, 1]."""
+        """Return the motion of one control step under ``actions`` (B, 7) in [-1, 1].
+
+        Robots that MuJoCo gave up on stand at home afterwards; ``faulty`` names them until the next step.
+        """
         target = self.middle + self.half_range * actions
         self._start[:] = self.joint_pos
-        late = self._substep_index < self._late_substeps[:, None]
+        self._clock[:] = self._time.reshape(-1)
         np.copyto(self._control, target[:, None, :])
-        np.copyto(self._control, self._held[:, None, :], where=late[:, :, None])
-        self._held = target
+        for age, held in enumerate(self._held):
+            late = self._substep_index < self._late_substeps[:, None] - age * self.substeps
+            np.copyto(self._control, held[:, None, :], where=late[:, :, None])
+        self._held[1:] = self._held[:-1]
+        self._held[0] = target
         self._records = self.batch.rollout(
             self.substeps,
             control=self._control,
@@ -144,4 +160,18 @@ class RobotBatch:
             out=self._records,
         )
         r = self._records
+        # MuJoCo resets a simulation that meets NaN or huge numbers, and rollout stops it: its time falls behind.
+        behind = self._clock + self.substeps * self.step_s - self._time.reshape(-1)
+        self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
+        if self.faulty.size:
+            self._recover(self.faulty)
         return Motion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)
+
+    def _recover(self, rows: Rows) -> None:
+        """Stand robots ``rows`` at home, at rest, as if they had been there for the whole control step."""
+        log.warning("robots sent home after a fault of the simulation count=%d first=%d", rows.size, rows[0])
+        self.go_home(rows, np.zeros((rows.size, 7)))
+        self._start[rows] = self.home
+        self._records["qpos"][rows] = self.home
+        self._records["actuator_force"][rows] = 0.0
+        self._records["sensordata"][rows] = 0.0

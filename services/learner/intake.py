@@ -113,7 +113,7 @@ class Intake:
         return self._verdict(VerdictKind.UNREADABLE, VerdictKind.UNREADABLE, reason)
 
     def report(self, report: ActorReport, now: float) -> Verdict:
-        """Return fresh credits for an actor that reported."""
+        """Return fresh credits for an actor, which is alive if it says so, whatever was thought."""
         account = self._heard(report.actor, report.incarnation, now)
         account.hear(report, self._standing.generation)
         account.is_alive = not report.leaving
@@ -122,8 +122,8 @@ class Intake:
 
     def gone(self, actor: str, incarnation: int) -> None:
         """Note that an actor died or left: what it had under way is lost, its credits are free."""
-        if (account := self._accounts.get((actor, incarnation))) is not None:
-            account.is_alive = False
+        account = self._accounts.setdefault((actor, incarnation), Account(actor, incarnation))
+        account.is_alive = False
 
     def take_dataset(self) -> tuple[Queued, ...]:
         """Return the rollouts of the next dataset, oldest first, and start its update; () while too few wait.
@@ -178,7 +178,6 @@ class Intake:
 
     def _heard(self, actor: str, incarnation: int, now: float) -> Account:
         account = self._accounts.setdefault((actor, incarnation), Account(actor, incarnation))
-        account.is_alive = True
         account.last_heard = now
         return account
 

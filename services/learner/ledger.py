@@ -92,7 +92,7 @@ class Account:
     def __init__(self, actor: str, incarnation: int) -> None:
         self.actor = actor
         self.incarnation = incarnation
-        self.is_alive = True
+        self.is_alive = True  # nothing that is missing will come from the dead
         self.last_heard = 0.0  # [s] on the caller's clock
         self.credit_limit = 0
         self._outcomes: dict[int, Outcome] = {}
@@ -137,8 +137,9 @@ class Account:
         elsewhere.update(dict.fromkeys(report.dropped, Fate.DROPPED))
         if report.generation == generation:
             # what it doesn't list was accepted, and not by us; before it has heard us, it can't tell yet
-            unlisted = set(range(report.published)) - set(report.in_flight) - elsewhere.keys()
-            elsewhere.update(dict.fromkeys(unlisted & self._missing, Fate.LOST))
+            listed = elsewhere.keys() | set(report.in_flight)
+            accepted = [s for s in self._missing if s < report.published and s not in listed]
+            elsewhere.update(dict.fromkeys(accepted, Fate.LOST))
         for sequence in elsewhere.keys() & self._missing:
             self.settle(sequence, elsewhere[sequence])
 

@@ -1,11 +1,13 @@
 """What every transport promises, held against both: within one process, and over Zenoh on loopback."""
 
 import os
+import signal
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
+from multiprocessing.synchronize import Event
 
 import pytest
 
@@ -468,7 +470,7 @@ def test_a_client_that_is_told_to_stop_gives_up_waiting_for_its_hub():
     stop = threading.Event()
     stop.set()
 
-    with pytest.raises(TransportError, match="no hub answered"):
+    with pytest.raises(TransportError, match="asked to stop while waiting for the hub at tcp/"):
         open_zenoh(ZenohConfig(endpoint=f"tcp/127.0.0.1:{free_port()}"), stop)
 
 
@@ -495,6 +497,36 @@ def test_a_session_that_a_fork_inherited_is_refused():
 
     hub._process -= 1
     assert hub.close()
+
+
+def be_a_hub(endpoint: str, serving: Event) -> None:
+    hub = open_zenoh(ZenohConfig(mode="hub", endpoint=endpoint))
+    server = hub.serve(f"{RUN}/rollout", capacity=8)
+    serving.set()
+    while True:
+        if (request := server.poll(timeout_s=1.0)) is not None:
+            request.reply(b"accepted")
+
+
+def test_a_hung_hub_holds_nobody_up_beyond_the_deadline():
+    context, endpoint = get_context("spawn"), f"tcp/127.0.0.1:{free_port()}"
+    serving = context.Event()
+    process = context.Process(target=be_a_hub, args=(endpoint, serving), daemon=True)
+    process.start()
+    assert serving.wait(20.0)
+    actor = open_zenoh(ZenohConfig(endpoint=endpoint))
+    assert actor.request(f"{RUN}/rollout", b"", 5.0, Flow.ROLLOUT).wait() == Reply(b"accepted")
+    os.kill(process.pid, signal.SIGSTOP)
+    started = time.monotonic()
+
+    outcome = actor.request(f"{RUN}/rollout", b"", 0.5, Flow.ROLLOUT).wait()
+    actor.publish(f"{RUN}/status/actor/0", b"", Flow.STATUS)
+    actor.close(timeout_s=1.0)
+
+    assert outcome is NoReply.TIMEOUT
+    assert time.monotonic() - started < 3.0
+    process.kill()
+    process.join(5.0)
 
 
 def leave_without_closing(endpoint: str) -> None:

@@ -48,6 +48,11 @@ def test_a_known_error_is_one_line_and_a_status(capsys, error, status, line):
     assert capsys.readouterr().err == line
 
 
+def test_a_service_may_have_known_errors_of_its_own(capsys):
+    assert run_service("learner", raising(KeyError("checkpoint")), known=(KeyError,)) == 1
+    assert capsys.readouterr().err == "learner: 'checkpoint'\n"
+
+
 def test_help_goes_to_stdout_and_is_no_error(capsys):
     assert run_service("learner", raising(HelpRequest("usage: learner\n"))) == 0
     assert capsys.readouterr().out == "usage: learner\n"

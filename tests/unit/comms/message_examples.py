@@ -8,7 +8,6 @@ import numpy as np
 from common.comms.messages import (
     MESSAGES,
     ActorReport,
-    Bye,
     Command,
     Control,
     ControlReply,
@@ -139,7 +138,6 @@ EXAMPLES: tuple[Any, ...] = (
         leaving=False,
     ),
     Status("actor", "actor-0", 3, 1.8e9, "playing", {"frames": 5.0}, {"lag": 1.0}),
-    Bye("actor", "actor-0", 3, {"published": 12.0}),
     Control(Command.PAUSE),
     ControlReply(ok=True, state="paused", reason=""),
 )

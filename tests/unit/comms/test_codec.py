@@ -156,6 +156,7 @@ BAD_OBS[2, 1, 3] = np.inf
         ("terminated", raw_array(np.ones((3, 2), bool)), "both terminated and truncated"),
         ("seconds", {"step": math.nan}, r"Rollout.seconds\['step'\]: nan"),
         ("seconds", {"step": "1"}, r"Rollout.seconds\['step'\]: '1' of type str"),
+        ("sequence", 2**40, "Rollout.sequence: 1099511627776; allowed: 0 to 4e\\+06"),
         ("episodes", 3, "Rollout.episodes: 3 of type int; allowed: dict"),
     ],
 )

@@ -76,4 +76,3 @@ def test_wildcards_stand_for_one_or_for_any_number_of_chunks(key_expr, key, want
 def test_the_expressions_for_everybody_match_every_member():
     assert matches(KEYS.every_alive(), KEYS.alive("actor", "a", 1))
     assert matches(KEYS.every_status(), KEYS.status("actor", "a"))
-    assert matches(KEYS.every_rally(), KEYS.rally(5))

@@ -62,7 +62,7 @@ def make_rules(
 
 
 def make_motion(before: Sequence[float], after: Sequence[float]) -> play.Motion:
-    """Return one control step of a robot that moves evenly from one pose to another, without force or contact."""
+    """Return one control step of a robot that moves evenly between two poses, without force or contact."""
     share = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
     start = np.array(before)
     return play.Motion(

@@ -6,6 +6,7 @@ import pytest
 
 from common.comms.codec import encode
 from common.comms.messages import VerdictKind
+from services.actor.outbox import Flight, Outbox, OutboxConfig, report
 from services.learner.intake import Intake, IntakeConfig
 from services.learner.ledger import Account, Fate, Remembered, restored, spans
 from services.learner.verdicts import RULES, open_rollout
@@ -119,7 +120,7 @@ def test_an_abandoned_update_is_lost():
     assert intake.ledgers()["actor-0", 1].lost == 1
 
 
-def test_a_dead_actors_missing_rollouts_are_lost_until_it_is_heard_again():
+def test_a_dead_actors_missing_rollouts_are_lost_until_it_reports_again():
     intake = make_intake()
     intake.arrive(make_header(3), ROLLOUT, 0.0)
     assert intake.ledgers()["actor-0", 1].in_flight == 4
@@ -127,7 +128,14 @@ def test_a_dead_actors_missing_rollouts_are_lost_until_it_is_heard_again():
 
     intake.gone("actor-0", 1)
     assert intake.ledgers()["actor-0", 1].lost == 3
-    intake.arrive(make_header(4), ROLLOUT, 0.0)
+    # what it sent before it died may be read after the news of its death
+    assert intake.arrive(make_header(4), ROLLOUT, 0.0).kind is VerdictKind.ACCEPTED
+    assert intake.ledgers()["actor-0", 1].lost == 3
+
+    outbox = Outbox(OutboxConfig(), next_sequence=5, generation=1)
+    flights = tuple(Flight(sequence, b"", born=0.0) for sequence in range(3))
+    outbox = dataclasses.replace(outbox, flights=flights)
+    intake.report(report(outbox, run="night", actor="actor-0", incarnation=1, version=10), 0.0)
 
     assert intake.ledgers()["actor-0", 1].lost == 0
 

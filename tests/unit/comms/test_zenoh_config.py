@@ -1,0 +1,44 @@
+import pytest
+from pydantic import ValidationError
+
+from common.comms.zenoh_config import ZenohConfig, session_settings
+
+FILES = {"tls_ca": "ca.pem", "tls_certificate": "learner.pem", "tls_key": "learner.key"}
+
+
+def test_only_the_hub_listens_and_only_clients_dial_it():
+    hub = session_settings(ZenohConfig(mode="hub", peers=("tcp/site:7447",)), attempt_s=2.0)
+    client = session_settings(ZenohConfig(), attempt_s=2.0)
+
+    assert (hub["mode"], hub["listen/endpoints"], hub["connect/endpoints"]) == (
+        "router",
+        ["tcp/127.0.0.1:7447"],
+        ["tcp/site:7447"],
+    )
+    assert (client["mode"], client["listen/endpoints"], client["connect/endpoints"]) == (
+        "client",
+        [],
+        ["tcp/127.0.0.1:7447"],
+    )
+
+
+def test_what_corrupted_or_exposed_something_is_off():
+    settings = session_settings(ZenohConfig(), attempt_s=2.0)
+
+    for path in (
+        "transport/shared_memory/enabled",
+        "scouting/multicast/enabled",
+        "scouting/gossip/enabled",
+        "adminspace/enabled",
+    ):
+        assert settings[path] is False
+
+
+def test_tls_certificates_are_needed_with_a_tls_endpoint_and_only_there():
+    settings = session_settings(ZenohConfig(endpoint="tls/site:7447", **FILES), attempt_s=2.0)
+
+    assert settings["transport/link/protocols"] == ["tls"]
+    assert settings["transport/link/tls"]["enable_mtls"] is True
+    for bad in ({"endpoint": "tls/site:7447"}, FILES, {"endpoint": "tls/site:7447", "tls_ca": "ca.pem"}):
+        with pytest.raises(ValidationError, match="allowed: all three with tls/"):
+            ZenohConfig(**bad)

@@ -1,0 +1,179 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+from rollouts import make_rollout
+
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import Moments
+from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
+from services.learner.curriculum import CurriculumConfig
+from services.learner.ppo import PPOConfig
+from services.learner.training import Training, play_stats
+
+PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_epochs=1)
+CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=50)
+EXTRAS = Extras(run="r", generation=7, stage_log=[], memory=[], trained_seconds=1.5)
+
+
+def make_training(seed=0):
+    return Training(PPO, NetworkConfig(units=(16, 8)), CURRICULUM, np.zeros(7, np.float32), seed)
+
+
+def dataset(epoch):
+    return [make_rollout(10 * epoch), make_rollout(10 * epoch + 1)]
+
+
+def state(training):
+    return [value.clone() for value in training.network.state_dict().values()]
+
+
+def assert_same(one, other):
+    assert one.progress == other.progress
+    for a, b in zip(state(one), state(other), strict=True):
+        assert torch.equal(a, b)
+    for which in ("obs_moments", "value_moments"):
+        a, b = getattr(one, which), getattr(other, which)
+        np.testing.assert_array_equal(a.mean, b.mean)
+        np.testing.assert_array_equal(a.var, b.var)
+        assert a.count == b.count
+
+
+def test_the_same_data_train_the_same_policy_bit_for_bit():
+    one, other = make_training(), make_training()
+    for epoch in range(4):
+        one.run_epoch(dataset(epoch))
+        other.run_epoch(dataset(epoch))
+
+    assert_same(one, other)
+    assert one.progress.frames == 4 * 2 * 16 * 8
+
+
+def test_the_normaliser_an_update_uses_is_the_one_its_actors_had():
+    training = make_training()
+    rollouts = dataset(0)
+    frozen = training.obs_moments
+
+    data, _ = training._dataset(rollouts)
+    training.run_epoch(rollouts)
+
+    np.testing.assert_array_equal(frozen.mean, 0.0)  # at the start it changes nothing but the clip
+    expected = np.clip(rollouts[0].obs.reshape(-1, 37), -5, 5)
+    np.testing.assert_allclose(data.obs[: len(expected)].numpy(), expected, rtol=1e-4)
+    every = np.concatenate([r.obs.reshape(-1, 37) for r in rollouts]).astype(np.float64)
+    merged = Moments.initial(37).merged(Moments.of(every))
+    np.testing.assert_allclose(training.obs_moments.mean, merged.mean, atol=1e-12)
+    np.testing.assert_allclose(training.obs_moments.var, merged.var, rtol=1e-12)
+
+
+def test_a_stage_change_carries_weights_over_and_resets_the_observation_count_alone():
+    training = make_training()
+    for epoch in range(2):
+        training.run_epoch(dataset(epoch))
+    assert training.datasets_left == 1
+    weights, values = state(training), training.value_moments.count
+
+    stats = training.run_epoch(dataset(2))
+
+    assert stats.stage_changed
+    assert (training.progress.stage, training.progress.stage_number, training.progress.epochs_in_stage) == (2, 1, 0)
+    assert training.obs_moments.count == 1
+    assert training.value_moments.count > values
+    assert any(not torch.equal(a, b) for a, b in zip(weights, state(training), strict=True))
+
+
+def test_the_first_epochs_of_a_new_stage_teach_the_critic_only():
+    probe = torch.from_numpy(make_rollout(77).obs.reshape(-1, 37))
+
+    def outputs(training):
+        with torch.no_grad():
+            return training.network(probe)
+
+    def moved(refit_epochs):
+        ppo = PPO.model_copy(update={"refit_epochs": refit_epochs, "learning_rate_min": 1e-3})
+        training = Training(ppo, NetworkConfig(units=(16, 8)), CURRICULUM, np.zeros(7, np.float32), 0)
+        for epoch in range(3):
+            training.run_epoch(dataset(epoch))
+        before, value_before = outputs(training)
+        training.run_epoch(dataset(3))
+        after, value_after = outputs(training)
+        return float((after - before).square().mean()), float((value_after - value_before).square().mean())
+
+    held, held_value = moved(refit_epochs=1)
+    free, free_value = moved(refit_epochs=0)
+
+    assert held < 0.1 * free
+    assert held_value > 0.2 * free_value
+
+
+def test_a_resumed_run_goes_on_bit_for_bit(tmp_path):
+    straight, before, after = make_training(), make_training(), make_training(seed=99)
+    for epoch in range(4):
+        straight.run_epoch(dataset(epoch))
+        before.run_epoch(dataset(epoch))
+    path = save(tmp_path, before, EXTRAS)
+    extras = restore(path, after)
+    for epoch in range(4, 8):
+        straight.run_epoch(dataset(epoch))
+        after.run_epoch(dataset(epoch))
+
+    assert extras == EXTRAS
+    assert_same(straight, after)
+
+
+def test_only_the_newest_checkpoints_are_kept(tmp_path):
+    training = make_training()
+    for epoch in range(5):
+        training.run_epoch(dataset(epoch))
+        save(tmp_path, training, EXTRAS)
+
+    assert [path.stem for path in checkpoints(tmp_path)] == ["00000003", "00000004", "00000005"]
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "no checkpoint"),
+        (lambda path: path.write_bytes(b"rubbish"), "not readable"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not readable"),
+        (lambda path: reword(path, '"format": 1', '"format": 9'), "has format 9; allowed is 1"),
+    ],
+)
+def test_an_unusable_checkpoint_is_refused_with_one_line(tmp_path, damage, message):
+    training = make_training()
+    training.run_epoch(dataset(0))
+    path = save(tmp_path, training, EXTRAS)
+    damage(path)
+
+    with pytest.raises(CheckpointError, match=message) as caught:
+        restore(path, make_training())
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_of_another_network_is_refused_with_the_parameter_that_differs(tmp_path):
+    path = save(tmp_path, make_training(), EXTRAS)
+    other = Training(PPO, NetworkConfig(units=(16, 9)), CURRICULUM, np.zeros(7, np.float32), 0)
+
+    with pytest.raises(CheckpointError, match=r"doesn't fit this configuration: weights '.*' have shape"):
+        restore(path, other)
+
+
+def reword(path, old, new):
+    """Change the header's text; it must keep its length."""
+    content = path.read_bytes()
+    old_bytes, new_bytes = json.dumps(old)[1:-1].encode(), json.dumps(new)[1:-1].encode()
+    assert content.count(old_bytes) == 1
+    path.write_bytes(content.replace(old_bytes, new_bytes))
+
+
+def test_balls_that_no_generator_validated_are_in_no_rate():
+    stats = play_stats([make_rollout(0), make_rollout(1)])
+
+    assert (stats.rallies, stats.unvalidated) == (8, 2)
+    assert (stats.caught, stats.over, stats.returned) == (4, 2, 2)
+    assert stats.error_sum == pytest.approx(0.4)
+    assert stats.outcomes.sum() == 8
+    np.testing.assert_allclose(stats.reward_terms, 2 * np.arange(8) / (2 * 16 * 8))

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+import torch
+
+from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_divergence, log_prob
+from common.policy.d2rl import D2RL
+from common.policy.weights import new_network
+
+PAPER_UNITS = (256, 128, 128, 64, 64, 32)
+
+
+def by_hand(trunk, obs):
+    """D2RL as its paper draws it, with plain matrix products."""
+    hidden = None
+    for k, layer in enumerate(trunk.layers):
+        seen = obs if k == 0 else np.concatenate((hidden, obs))
+        z = layer.weight.detach().numpy().astype(np.float64) @ seen + layer.bias.detach().numpy()
+        hidden = np.where(z > 0, z, np.exp(np.minimum(z, 0)) - 1)
+    return hidden
+
+
+def test_every_hidden_layer_after_the_first_sees_the_observation_again():
+    torch.manual_seed(0)
+    trunk = D2RL(37, PAPER_UNITS)
+    obs = np.random.default_rng(0).normal(size=37)
+
+    with torch.no_grad():
+        got = trunk(torch.from_numpy(obs.astype(np.float32))[None])[0].numpy()
+
+    assert [layer.in_features for layer in trunk.layers] == [37, 256 + 37, 128 + 37, 128 + 37, 64 + 37, 64 + 37]
+    np.testing.assert_allclose(got, by_hand(trunk, obs), atol=2e-5)
+
+
+def test_the_papers_trunk_has_its_published_number_of_parameters():
+    count = sum(p.numel() for p in D2RL(37, PAPER_UNITS).parameters())
+
+    assert count == 89_024
+
+
+@pytest.mark.parametrize(("trunks", "parameters"), [("shared", 89_024 + 264 + 7), ("separate", 2 * 89_024 + 264 + 7)])
+def test_actor_and_critic_share_all_but_the_last_layers_or_nothing(trunks, parameters):
+    network = new_network(NetworkConfig(trunks=trunks))
+
+    assert sum(p.numel() for p in network.parameters()) == parameters
+
+
+def test_training_starts_from_a_robot_that_holds_its_home_pose():
+    home = np.linspace(-0.9, 0.9, 7, dtype=np.float32)
+    network = ActorCritic(37, 7, NetworkConfig(), home)
+
+    mean, value = network(torch.zeros(5, 37))
+
+    assert mean.shape == (5, 7)
+    assert value.shape == (5,)
+    np.testing.assert_allclose(mean.detach().numpy(), np.tile(home, (5, 1)), atol=1e-3)
+    np.testing.assert_allclose(network.log_sigma.detach().numpy(), -1.6)
+
+
+def test_log_probability_entropy_and_divergence_are_the_gaussians():
+    rng = np.random.default_rng(1)
+    mean, other = (torch.from_numpy(rng.normal(size=(4, 7))) for _ in range(2))
+    log_sigma, log_other = (torch.from_numpy(rng.normal(size=7) * 0.3) for _ in range(2))
+    actions = torch.from_numpy(rng.normal(size=(4, 7)))
+    p = torch.distributions.Normal(mean, log_sigma.exp())
+    q = torch.distributions.Normal(other, log_other.exp())
+
+    torch.testing.assert_close(log_prob(actions, mean, log_sigma), p.log_prob(actions).sum(-1))
+    torch.testing.assert_close(entropy(log_sigma), p.entropy().sum(-1)[0])
+    torch.testing.assert_close(
+        kl_divergence(mean, log_sigma, other, log_other), torch.distributions.kl_divergence(p, q).sum(-1).mean()
+    )

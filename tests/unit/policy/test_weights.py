@@ -1,0 +1,116 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import Moments
+from common.policy.weights import (
+    ACTION_CONTRACT,
+    CONTRACT_FILE,
+    OBSERVATION_CONTRACT,
+    WEIGHTS_FILE,
+    Contract,
+    PolicyError,
+    load_policy,
+    new_network,
+    pack,
+    save_policy,
+    task_hash,
+    unpack,
+)
+
+SMALL = NetworkConfig(units=(16, 8))
+
+
+def make_contract(**changes):
+    values = {
+        "observation": OBSERVATION_CONTRACT,
+        "action": ACTION_CONTRACT,
+        "network": SMALL,
+        "control_rate_hz": 50.0,
+        "robot": "rails",
+        "launch": "paper",
+        "noise": "standard",
+        "run": "r",
+        "generation": 1,
+        "version": 2,
+        "stage": 3,
+        "frames": 4,
+    }
+    return Contract(**(values | changes))
+
+
+def saved(folder):
+    torch.manual_seed(1)
+    network = new_network(SMALL, np.full(7, 0.3, np.float32))
+    moments = Moments(np.linspace(-1, 1, 37), np.linspace(0.5, 2, 37), 123_456_789_012)
+    save_policy(folder, network, moments, make_contract())
+    return network, moments
+
+
+def test_a_policy_comes_back_from_its_folder_bit_for_bit(tmp_path):
+    network, moments = saved(tmp_path / "latest")
+
+    policy = load_policy(tmp_path / "latest")
+
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, policy.network.state_dict()[name])
+    np.testing.assert_array_equal(policy.moments.mean, moments.mean)
+    assert policy.moments.count == moments.count
+    assert policy.contract == make_contract()
+
+
+def test_a_newer_policy_replaces_the_older_and_leaves_nothing_behind(tmp_path):
+    for _ in range(3):
+        saved(tmp_path / "latest")
+
+    assert len([path for path in tmp_path.iterdir() if not path.is_symlink()]) == 1
+    assert load_policy(tmp_path / "latest").contract.version == 2
+
+
+def test_weights_travel_as_bytes_and_arrive_unchanged():
+    one, other = new_network(SMALL), new_network(SMALL)
+
+    unpack(other, pack(one))
+
+    for name, value in one.state_dict().items():
+        assert torch.equal(value, other.state_dict()[name])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / WEIGHTS_FILE).unlink(), "no policy in .*No such file.*wanted is a folder"),
+        (lambda folder: (folder / WEIGHTS_FILE).write_bytes(b"rubbish"), "not readable as safetensors"),
+        (lambda folder: (folder / CONTRACT_FILE).write_text("{"), r"contract.json: file: Invalid JSON"),
+        (lambda folder: edit(folder, "robot", None), r"contract.json: robot: Input should be a valid string"),
+        (lambda folder: edit(folder, "surprise", 1), r"contract.json: surprise: Extra inputs"),
+        (lambda folder: edit(folder, "observation", []), "layout is not this version's"),
+        (lambda folder: edit(folder, "network", {"units": [16, 9]}), r"shape \(.*\); allowed is"),
+        (lambda folder: edit(folder, "network", {"units": [16, 8, 8]}), "weights lack"),
+    ],
+)
+def test_an_unusable_policy_is_refused_with_one_line_that_says_why(tmp_path, damage, message):
+    saved(tmp_path / "p")
+    damage((tmp_path / "p").resolve())
+
+    with pytest.raises(PolicyError, match=message) as caught:
+        load_policy(tmp_path / "p")
+
+    assert "\n" not in str(caught.value)
+
+
+def edit(folder, key, value):
+    contract = json.loads((folder / CONTRACT_FILE).read_text())
+    (folder / CONTRACT_FILE).write_text(json.dumps(contract | {key: value}))
+
+
+def test_learner_and_actors_disagree_about_any_difference_in_the_task():
+    base = task_hash(SMALL, {"noise": "standard"}, "paper")
+
+    assert task_hash(SMALL, {"noise": "standard"}, "paper") == base
+    assert task_hash(NetworkConfig(units=(16, 9)), {"noise": "standard"}, "paper") != base
+    assert task_hash(SMALL, {"noise": "off"}, "paper") != base
+    assert task_hash(SMALL, {"noise": "standard"}, "strong") != base

@@ -1,0 +1,103 @@
+"""The layouts of the 37 and the 7, and what stands in them."""
+
+import numpy as np
+import pytest
+
+from common.physics.arm import racket_motion, racket_pose
+from common.rally import play
+from common.rally.noise import PROFILES
+from common.rally.observation import ACTION, OBSERVATION, offsets, size
+from common.rally.trajectory import State
+from tests.unit.rally.scripted import HOME, begin, make_motion, make_record, make_rules
+
+AT = offsets(OBSERVATION)
+RECORD = make_record((0.7, 0.2, 0.6), (-1, 0.5, 0.1), (10, 20, 30))
+
+
+def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=RECORD) -> np.ndarray:
+    """Return what is observed after one control step in which the robot moved by ``rates``."""
+    rallies, step = begin(record, state, target=(0.9, -0.3))
+    start = np.array(joints) - 0.02 * np.array(rates)
+    play.play_step(rallies, make_motion(start, joints), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
+    out = np.empty((1, 37), np.float32)
+    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), out)
+    return out[0]
+
+
+def test_the_observation_has_37_numbers_in_the_papers_order_and_the_action_7():
+    assert [(part.name, part.size) for part in OBSERVATION] == [
+        ("joint_pos", 7),
+        ("joint_vel", 7),
+        ("racket_pos", 3),
+        ("racket_quat", 4),
+        ("racket_vel", 3),
+        ("ball_pos", 3),
+        ("ball_vel", 3),
+        ("target", 2),
+        ("trajectory_state", 1),
+        ("continuous_state", 4),
+    ]
+    assert size(OBSERVATION) == 37
+    assert size(ACTION) == 7
+
+
+def test_the_parts_follow_one_another_without_gap():
+    ends = [0, *(part.stop for part in AT.values())]
+
+    assert [part.start for part in AT.values()] == ends[:-1]
+
+
+def test_joints_and_racket_are_those_of_the_robot():
+    joints, rates = (0.1, -0.2, 0.3, 0.9, 1.1, 1.0, -0.4), (1.0, 2.0, -3.0, 0.5, 0.6, -0.7, 4.0)
+    obs = observed(joints, rates)
+
+    np.testing.assert_allclose(obs[AT["joint_pos"]], joints, rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["joint_vel"]], rates, rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["racket_pos"]], racket_pose(joints).centre, rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["racket_vel"]], racket_motion(joints, rates)[0], rtol=1e-6)
+
+
+def test_ball_and_target_stand_where_the_layout_says():
+    obs = observed()
+    rallies, step = begin(RECORD)
+    play.play_step(rallies, make_motion(HOME, HOME), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
+
+    np.testing.assert_allclose(obs[AT["ball_pos"]], rallies.ball[0, :3], rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["ball_vel"]], rallies.ball[0, 3:6], rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["target"]], [0.9, -0.3], rtol=1e-6)
+
+
+def test_spin_is_not_observed():
+    other = make_record(RECORD[:3], RECORD[3:6], (-90, 5, 60))
+
+    np.testing.assert_array_equal(observed(), observed(record=other))
+
+
+@pytest.mark.parametrize(
+    ("state", "number", "one_hot"),
+    [
+        (State.TAU_01, -1.0, [1, 0, 0, 0]),
+        (State.TAU_12, -1 / 3, [0, 1, 0, 0]),
+        (State.TAU_23, 1 / 3, [0, 0, 1, 0]),
+        (State.TAU_30, 1.0, [0, 0, 0, 1]),
+    ],
+)
+def test_the_trajectory_state_is_shown_as_a_number_and_one_hot(state, number, one_hot):
+    obs = observed(state=state)
+
+    assert obs[AT["trajectory_state"]] == pytest.approx(number)
+    np.testing.assert_array_equal(obs[AT["continuous_state"]], one_hot)
+
+
+def test_the_rackets_frame_is_near_the_identity_at_home():
+    np.testing.assert_allclose(observed()[AT["racket_quat"]], [1, 0, 0, 0], atol=0.03)
+
+
+def test_near_home_the_quaternion_moves_without_jumps_of_sign():
+    """Every pose within 0.6 rad of home in yaw, roll and the racket's pitch stays far from w = 0."""
+    rng = np.random.default_rng(0)
+    joints = np.array(HOME) + rng.uniform(-1, 1, (300, 7)) * [0.5, 0.5, 0.6, 0.2, 0.2, 0.2, 0.6]
+    quaternions = np.array([observed(tuple(q))[AT["racket_quat"]] for q in joints])
+
+    assert quaternions[:, 0].min() > 0.7
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0, atol=1e-6)

@@ -1,0 +1,201 @@
+"""The reward: R as the paper prints it, e_r as a penalty, and how instants and rates are paid."""
+
+import numpy as np
+import pytest
+
+from common.physics.arm import racket_pose
+from common.rally import play
+from common.rally.noise import PROFILES
+from common.rally.reward import FEATURES, TERMS, R, RewardConfig, reward_table
+from common.rally.trajectory import Outcome, State
+from tests.unit.rally.scripted import AWAY, HOME, begin, make_motion, make_record, make_rules, play_ball
+
+# The paper's matrix once more: entries as it prints them, rows tau_0 .. tau_30, columns stage 1 .. 3
+PRINTED = """
+    0   | 0     | 0
+    1g  | .25g  | .1g
+    10  | 4     | 1
+    1g  | .25g  | .1g
+    25  | 50+v  | 10
+    0   | 0     | b
+    0   | 0     | 30+40l
+    0   | 0     | 0
+"""
+SYMBOLS = {"g": "g", "v": "speed", "b": "aim", "l": "landing"}
+LOW = (0.013, 0.0, 0.0, 1.571, 0.582, np.pi - 2.153, 0.0)
+"""The racket stands upright on the table: centre at x = -1.05, z = 0.08."""
+
+
+def parsed(entry: str) -> list[float]:
+    """Return an entry's weights in the order of FEATURES."""
+    weights = dict.fromkeys(FEATURES, 0.0)
+    for term in entry.strip().split("+"):
+        name = SYMBOLS.get(term[-1], "constant")
+        number = term if name == "constant" else term[:-1]
+        weights[name] += float(number or 1.0)
+    return list(weights.values())
+
+
+def pay(
+    stage: int = 1, rate_scale: float = 1.0, action: float = 0.0, **forces: np.ndarray
+) -> dict[str, float]:
+    """Return the terms of one control step of a ball on its way to a still robot."""
+    rallies, step = begin(make_record((0.7, 0, 0.6), (-1, 0, 0)))
+    actions = np.zeros((1, 7))
+    actions[0, :2] = action
+    rules = make_rules(stage, rate_scale)
+    motion = make_motion(HOME, HOME)._replace(**forces)
+    play.play_step(rallies, motion, actions, rules, PROFILES["off"], step)
+    assert step.reward[0] == pytest.approx(step.terms[0].sum())
+    return dict(zip(TERMS, step.terms[0], strict=True))
+
+
+def hit(racket_speed: float, stage: int) -> dict[str, float]:
+    """Return the summed terms of a bounced ball that meets a racket driving along x."""
+    joints = (-0.03 * racket_speed, *HOME[1:])
+    played = play_ball(
+        (-0.75, 0, 0.23),
+        (-8, 0, 0.3),
+        state=State.TAU_12,
+        joints=joints,
+        rates=(racket_speed, *[0.0] * 6),
+        rules=make_rules(stage),
+    )
+    return dict(zip(TERMS, played.terms.sum(axis=0), strict=True))
+
+
+def test_the_matrix_is_the_papers():
+    rows = [[parsed(entry) for entry in row.split("|")] for row in PRINTED.strip().splitlines()]
+    table = reward_table(RewardConfig())
+
+    np.testing.assert_array_equal(table, np.swapaxes(rows, 0, 1))
+
+
+def test_the_matrix_has_an_entry_for_every_state_stage_and_feature():
+    assert set(R) == set(State)
+    assert {len(columns) for columns in R.values()} == {3}
+    assert {len(entry) for columns in R.values() for entry in columns} == {len(FEATURES)}
+
+
+def test_a_stage_2_landing_bonus_is_paid_there_and_only_there():
+    plain, bonus = reward_table(RewardConfig()), reward_table(RewardConfig(stage_2_landing=12.0))
+    difference = bonus - plain
+
+    assert difference[1, State.TAU_3, 0] == 12.0
+    assert np.count_nonzero(difference) == 1
+
+
+@pytest.mark.parametrize(("stage", "weight"), [(1, 1.0), (2, 0.25), (3, 0.1)])
+def test_approaching_pays_by_the_distance_of_racket_and_ball(stage, weight):
+    """The ball after 20 ms of fall at 1 m/s, the racket at home: d_rb from their coordinates."""
+    ball = np.array([0.7 - 0.02, 0.0, 0.6 - 9.81 / 2 * 0.02**2])
+    d_rb = np.linalg.norm(ball - racket_pose(HOME).centre)
+
+    assert pay(stage)["catch_approach"] == pytest.approx(weight / (1 + d_rb**2) ** 2)
+
+
+def test_torque_is_fined_by_its_share_of_the_limit():
+    torque = np.zeros((1, 5, 7))
+    torque[..., 0], torque[..., 6] = -100.0, 3.0  # a quarter of 400 N, and all of 3 Nm
+
+    assert pay(torque=torque)["torque"] == pytest.approx(-0.02 * 1.25)
+
+
+def test_contact_forces_are_fined_each_body_up_to_fifty_newton():
+    contact = np.zeros((1, 5, 4))
+    contact[..., 0], contact[..., 3] = 25.0, 400.0
+
+    assert pay(contact=contact)["collision"] == pytest.approx(-0.1 * 1.5)
+
+
+def test_a_contact_of_one_substep_in_five_costs_a_fifth():
+    contact = np.zeros((1, 5, 4))
+    contact[0, 2, 1] = 50.0
+
+    assert pay(contact=contact)["collision"] == pytest.approx(-0.1 / 5)
+
+
+def test_jitter_is_fined_by_the_squared_change_of_action():
+    assert pay(action=0.5)["jitter"] == pytest.approx(-0.02 * (0.5**2 + 0.5**2))
+
+
+def test_a_steady_action_costs_no_jitter_the_second_time():
+    rallies, step = begin(make_record((0.7, 0, 0.6), (-1, 0, 0)))
+    for _ in range(2):
+        play.play_step(rallies, make_motion(AWAY, AWAY), np.ones((1, 7)), make_rules(), PROFILES["off"], step)
+
+    assert step.terms[0, TERMS.index("jitter")] == 0.0
+
+
+def test_e_r_is_a_penalty_whatever_the_stage():
+    """The paper prints a plus before e_r, with positive coefficients: that would pay for shaking."""
+    forces = {"torque": np.full((1, 5, 7), 2.0), "contact": np.full((1, 5, 4), 10.0)}
+    for stage in (1, 2, 3):
+        terms = pay(stage, action=1.0, **forces)
+
+        assert max(terms["torque"], terms["jitter"], terms["collision"]) < 0.0
+
+
+def test_rates_are_scaled_with_the_control_rate_and_jitter_is_not():
+    forces = {"torque": np.full((1, 5, 7), 2.0), "contact": np.full((1, 5, 4), 10.0)}
+    reference, quarter = pay(action=1.0, **forces), pay(action=1.0, rate_scale=0.25, **forces)
+
+    for rate in ("catch_approach", "torque", "collision"):
+        assert quarter[rate] == pytest.approx(0.25 * reference[rate])
+    assert quarter["jitter"] == reference["jitter"]
+
+
+def test_bounce_and_hit_in_one_control_step_are_both_paid():
+    """Half-volley: 8 ms to the table, some 5 ms more to the racket that stands on it."""
+    played = play_ball((-0.96, 0, 0.06), (-5, 0, -5), joints=LOW, steps=1)
+
+    assert played.states == [State.TAU_23]
+    np.testing.assert_array_equal(played.terms[0], [0, 10, 25, 0, 0, 0, 0, 0])
+
+
+def test_instants_are_paid_once_and_take_their_steps_dense_row():
+    played = play_ball((-0.3, 0, 0.3), (-1, 0, 0))
+    bounce, approach = played.terms[:, 1], played.terms[:, 0]
+
+    assert np.count_nonzero(bounce) == 1
+    assert approach[np.flatnonzero(bounce)[0]] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("racket_speed", "paid"), [(-3.0, 0.0), (2.0, 2.0), (12.0, 10.0)], ids=["back", "forward", "too fast"]
+)
+def test_stage_2_pays_the_rackets_speed_towards_the_opponent_from_0_to_10(racket_speed, paid):
+    assert hit(racket_speed, stage=2)["contact"] == pytest.approx(50.0 + paid)
+
+
+@pytest.mark.parametrize(("stage", "paid"), [(1, 25.0), (3, 10.0)])
+def test_the_rackets_speed_is_paid_in_no_other_stage(stage, paid):
+    assert hit(2.0, stage)["contact"] == pytest.approx(paid)
+
+
+def test_a_landing_half_a_metre_off_pays_30_and_40_over_one_and_a_quarter_squared():
+    played = play_ball(
+        (0.7, 0.1, 0.3), (0, 0, 0), state=State.TAU_23, target=(0.7, 0.6), rules=make_rules(stage=3)
+    )
+
+    assert played.outcome == Outcome.RETURNED
+    assert played.landing_error == pytest.approx(0.5)
+    assert played.terms[-1, TERMS.index("landing")] == pytest.approx(30.0 + 40.0 / 1.25**2)
+
+
+def test_a_length_scale_makes_the_landing_reward_steeper():
+    rules = make_rules(stage=3, reward=RewardConfig(landing_scale=0.25))
+    played = play_ball((0.7, 0.1, 0.3), (0, 0, 0), state=State.TAU_23, target=(0.7, 0.6), rules=rules)
+
+    assert played.terms[-1, TERMS.index("landing")] == pytest.approx(30.0 + 40.0 / (1.0 + 4.0) ** 2)
+
+
+def test_on_its_way_back_the_ball_pays_by_its_distance_to_the_target_in_space():
+    played = play_ball(
+        (0.5, 0.2, 0.8), (0, 0, 0), state=State.TAU_23, target=(0.9, 0.5), rules=make_rules(stage=3), steps=1
+    )
+    height = 0.8 - 9.81 / 2 * 0.02**2
+    # the target is a ball that lies on the table: its centre is 20 mm up
+    d_bt = np.sqrt(0.4**2 + 0.3**2 + (height - 0.02) ** 2)
+
+    assert played.terms[0, TERMS.index("aim")] == pytest.approx(1.0 / (1.0 + d_bt**2) ** 2)
