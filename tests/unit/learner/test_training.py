@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,17 +91,21 @@ def test_the_first_epochs_of_a_new_stage_teach_the_critic_only():
         with torch.no_grad():
             return training.network(probe)
 
+    curriculum = CURRICULUM.model_copy(update={"stage_2": 50})
+
     def moved(refit_epochs):
-        ppo = PPO.model_copy(update={"refit_epochs": refit_epochs, "learning_rate_min": 1e-3})
-        training = Training(ppo, NetworkConfig(units=(16, 8)), CURRICULUM, np.zeros(7, np.float32), 0)
+        ppo = PPO.model_copy(update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3})
+        training = Training(ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
         for epoch in range(3):
             training.run_epoch(dataset(epoch))
         before, value_before = outputs(training)
-        training.run_epoch(dataset(3))
+        telling = [replace(r, rewards=10 * r.actions[..., 0]) for r in dataset(3)]
+        for _ in range(4):
+            training.run_epoch(telling)
         after, value_after = outputs(training)
         return float((after - before).square().mean()), float((value_after - value_before).square().mean())
 
-    held, held_value = moved(refit_epochs=1)
+    held, held_value = moved(refit_epochs=4)
     free, free_value = moved(refit_epochs=0)
 
     assert held < 0.1 * free
