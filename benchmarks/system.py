@@ -98,8 +98,12 @@ def main() -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.system", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object, last line")
-    parser.add_argument("--seconds", type=float, default=60.0, help="length of the measurement [s] (default 60)")
-    parser.add_argument("--warm-up", type=float, default=10.0, help="time between the first trained batch and it [s]")
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, help="length of the measurement [s] (default 60)"
+    )
+    parser.add_argument(
+        "--warm-up", type=float, default=10.0, help="time between the first trained batch and it [s]"
+    )
     parser.add_argument("--actors", type=int, default=DeployConfig().actors, help="actor processes")
     parser.add_argument("--keep", action="store_true", help="keep the run folder")
     arguments = parser.parse_args()

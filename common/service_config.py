@@ -16,11 +16,15 @@ class ServiceConfig(ZenohConfig):
     id: str = Field("0", description="name of this service among those of its role")
     metrics_port: int = Field(0, ge=0, le=65535, description="HTTP port of /metrics; 0 takes any free one")
     metrics_host: str = Field("127.0.0.1", description="address that /metrics is served on")
-    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="least severe lines logged")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="least severe lines logged"
+    )
     status_interval_s: float = Field(
         1.0, gt=0, le=60, description="time between heartbeats", json_schema_extra={"unit": "s"}
     )
-    seed: int = Field(0, ge=0, lt=2**63, description="of everything random in the run; the same at every service")
+    seed: int = Field(
+        0, ge=0, lt=2**63, description="of everything random in the run; the same at every service"
+    )
 
 
 def new_incarnation() -> int:

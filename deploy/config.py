@@ -24,7 +24,10 @@ class DeployConfig(BaseModel):
     generators: int = Field(1, ge=1, le=100, description="generator processes")
     shards: int = Field(0, ge=0, le=4096, description="rally shards; 0: as many as actors")
     minutes: float = Field(
-        0.0, ge=0, description="stop this long after the first trained batch; 0: the whole curriculum", json_schema_extra={"unit": "min"}
+        0.0,
+        ge=0,
+        description="stop this long after the first trained batch; 0: the whole curriculum",
+        json_schema_extra={"unit": "min"},
     )
     frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
     resume: bool = Field(False, description="go on with runs/RUN from its newest checkpoint")
@@ -32,7 +35,9 @@ class DeployConfig(BaseModel):
     metrics_port: int = Field(
         0, ge=0, le=64000, description="first port of /metrics, one up for each process; 0: any free ones"
     )
-    panel: Literal["auto", "on", "off"] = Field("auto", description="live terminal panel; auto: if there is a terminal")
+    panel: Literal["auto", "on", "off"] = Field(
+        "auto", description="live terminal panel; auto: if there is a terminal"
+    )
     evaluate: bool = Field(True, description="follow the run with an evaluator, and measure the final policy")
     final_rallies: int = Field(1000, ge=1, description="rallies of the final measure")
     seed: int = Field(0, ge=0, lt=2**63, description="of everything random in the run")
@@ -68,6 +73,15 @@ def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str)
             "shards": shards,
             "of": config.generators,
         },
-        "evaluator": {"env": env, "network": network, "launch": config.launch, "noise": config.env.noise, "folder": folder},
+        "evaluator": {
+            "env": env,
+            "network": network,
+            "launch": config.launch,
+            "noise": config.env.noise,
+            "folder": folder,
+        },
     }
-    return {role: getattr(config, role).model_dump(mode="json", by_alias=True) | shared | values for role, values in own.items()}
+    return {
+        role: getattr(config, role).model_dump(mode="json", by_alias=True) | shared | values
+        for role, values in own.items()
+    }

@@ -45,7 +45,15 @@ def specs(config: DeployConfig, config_file: Path) -> list[Spec]:
 
     def service(role: str, index: int, *more: str) -> Spec:
         port = config.metrics_port + ports[role] + index if config.metrics_port else 0
-        arguments = (f"services.{role}", "--config", str(config_file), "--id", str(index), "--metrics-port", str(port))
+        arguments = (
+            f"services.{role}",
+            "--config",
+            str(config_file),
+            "--id",
+            str(index),
+            "--metrics-port",
+            str(port),
+        )
         # The learner holds the run's state: its death ends the run, with its exit status, and --resume goes on.
         return Spec(f"{role}-{index}", role, (*arguments, *more), restart=role != "learner")
 
@@ -70,7 +78,9 @@ def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
     run = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
     folder = RunFolder.of(run)
     if folder.config.exists() and not config.resume:
-        raise ConfigError(f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run")
+        raise ConfigError(
+            f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
+        )
     if config.resume and not folder.config.exists():
         raise ConfigError(f"run {run!r} can't be resumed: there is no {folder.config}")
     folder.create()
@@ -93,16 +103,26 @@ def final_line(run: str, folder: RunFolder, config: DeployConfig, learner: Statu
         "stage": int(gauges.get("stage", 0)),
         "seconds": round(gauges.get("seconds", 0.0), 1),
         "ledger": {
-            name: int(counters.get(name, 0)) for name in ("published", "trained", "refused", "dropped", "in_flight", "lost")
+            name: int(counters.get(name, 0))
+            for name in ("published", "trained", "refused", "dropped", "in_flight", "lost")
         },
     }
     if config.evaluate:
         command = [sys.executable, "-m", "services.evaluator", "--config", str(folder.config)]
-        command += ["--policy", str(folder.latest_policy), "--rallies", str(config.final_rallies), "--json", "true"]
+        command += [
+            "--policy",
+            str(folder.latest_policy),
+            "--rallies",
+            str(config.final_rallies),
+            "--json",
+            "true",
+        ]
         command += ["--launch", "paper", "--noise", "standard"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode != 0:
-            raise RuntimeError(f"the final evaluation failed: {(done.stderr or done.stdout).strip().splitlines()[-1:]}")
+            raise RuntimeError(
+                f"the final evaluation failed: {(done.stderr or done.stdout).strip().splitlines()[-1:]}"
+            )
         measured = json.loads(done.stdout.strip().splitlines()[-1])
         measured.pop("policy", None)
         measured["evaluation_seconds"] = measured.pop("seconds")

@@ -91,7 +91,12 @@ def render(view: View, now: float) -> RenderableType:
     play = Table(box=None, padding=(0, 2), header_style="dim")
     for title in ("", "catch", "return", "error"):
         play.add_column(title, justify="right" if title else "left")
-    play.add_row("training, with noise", _percent(gauges, "catch_rate"), _percent(gauges, "return_rate"), _metres(gauges, "target_error"))
+    play.add_row(
+        "training, with noise",
+        _percent(gauges, "catch_rate"),
+        _percent(gauges, "return_rate"),
+        _metres(gauges, "target_error"),
+    )
     at = f" at {measured['frames'] / 1e6:.1f} M" if "frames" in measured else ""
     play.add_row(
         f"evaluation{at}",
@@ -111,7 +116,10 @@ def render(view: View, now: float) -> RenderableType:
     )
     ledger = Table.grid(padding=(0, 3))
     ledger.add_row(
-        *(f"{name.replace('_', ' ')} {counters.get(name, 0):.0f}" for name in ("published", "trained", "in_flight", "refused", "dropped")),
+        *(
+            f"{name.replace('_', ' ')} {counters.get(name, 0):.0f}"
+            for name in ("published", "trained", "in_flight", "refused", "dropped")
+        ),
         Text(f"lost {counters.get('lost', 0):.0f}", style="red" if counters.get("lost", 0) else ""),
     )
 
@@ -122,7 +130,14 @@ def render(view: View, now: float) -> RenderableType:
         name = f"{role}-{id_}"
         silence = now - view.heard[role, id_]
         style = "red" if silence > STALE_S else ""
-        who.add_row(name, status.state, _doing(status), f"{silence:.0f} s ago", str(view.restarts.get(name, 0)), style=style)
+        who.add_row(
+            name,
+            status.state,
+            _doing(status),
+            f"{silence:.0f} s ago",
+            str(view.restarts.get(name, 0)),
+            style=style,
+        )
     bar = ProgressBar(total=1.0, completed=share_done(view), width=60)
     rows: list[RenderableType] = [head, bar, Text(""), play, Text(""), learning, ledger, Text(""), who]
     return Panel(Group(*rows), title=f"Topspin {view.run}", border_style="cyan", padding=(0, 1))

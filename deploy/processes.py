@@ -59,7 +59,11 @@ class Family:
     def _start(self, spec: Spec) -> subprocess.Popen[bytes]:
         with (self._logs / f"{spec.name}.log").open("ab") as log_file:
             # One thread each: with more, numerics libraries on every process fight for the same cores.
-            environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+            environment = os.environ | {
+                "OMP_NUM_THREADS": "1",
+                "OPENBLAS_NUM_THREADS": "1",
+                "MKL_NUM_THREADS": "1",
+            }
             return subprocess.Popen(
                 [sys.executable, "-m", *spec.arguments],
                 stdin=subprocess.DEVNULL,
@@ -81,7 +85,12 @@ class Family:
                     continue
                 child.deaths_in_a_row = 1 if now - child.started > STABLE_S else child.deaths_in_a_row + 1
                 child.restart_at = now + restart_pause(child.deaths_in_a_row)
-                log.warning("process died name=%s pid=%d status=%d; starting it again", child.spec.name, child.process.pid, status)
+                log.warning(
+                    "process died name=%s pid=%d status=%d; starting it again",
+                    child.spec.name,
+                    child.process.pid,
+                    status,
+                )
             if child.restart_at is not None and now >= child.restart_at:
                 child.process = self._start(child.spec)
                 child.started, child.restart_at = now, None
@@ -93,7 +102,9 @@ class Family:
 
     def stop(self, names: list[str], patience_s: float) -> None:
         """Ask processes to end, and end those that don't."""
-        running = [self.children[name].process for name in names if self.children[name].process.poll() is None]
+        running = [
+            self.children[name].process for name in names if self.children[name].process.poll() is None
+        ]
         for process in running:
             process.send_signal(signal.SIGTERM)
         deadline = time.monotonic() + patience_s

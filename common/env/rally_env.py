@@ -117,7 +117,7 @@ def _draw_robot(
     """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds.
 
     Returns:
-        Which robots stay as they are (n,), and a number in [0, 1) that decides who goes on over a return (n,).
+        Which robots stay as they are (n,); a number in [0, 1) that decides on going on over a return (n,).
     """
     stay, go_on = np.empty(seeds.shape[0], np.bool_), np.empty(seeds.shape[0])
     low, high = noise.gain_factor

@@ -169,7 +169,7 @@ class RobotBatch:
 
     def _recover(self, rows: Rows) -> None:
         """Stand robots ``rows`` at home, at rest, as if they had been there for the whole control step."""
-        log.warning("robots sent home after a fault of the simulation count=%d first=%d", rows.size, rows[0])
+        log.warning("robots sent home after a simulation fault count=%d first=%d", rows.size, rows[0])
         self.go_home(rows, np.zeros((rows.size, 7)))
         self._start[rows] = self.home
         self._records["qpos"][rows] = self.home

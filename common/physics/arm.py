@@ -38,7 +38,9 @@ BEAM_RADIUS = 0.050
 BEAM_Z = 0.10
 BEAM_HALF_LENGTH = 1.1
 
-REACH = UPPER_ARM + FOREARM + RACKET_REACH + RACKET_RADIUS + 0.002  # [m] shoulder to the rim, with its thickness
+REACH = (
+    UPPER_ARM + FOREARM + RACKET_REACH + RACKET_RADIUS + 0.002
+)  # [m] shoulder to the rim, with its thickness
 """No point of arm or racket is farther from the pitch axis than this."""
 
 

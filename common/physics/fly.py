@@ -91,7 +91,9 @@ def _march(
     t = 0.0
     gap = _gap(what, p0, trajectory, start, robot_step)
     if gap <= 0.0:
-        later = _gap(what, _path(p0, v0, p1, v1, h, SMALLEST_MARCH), trajectory, start + SMALLEST_MARCH, robot_step)
+        later = _gap(
+            what, _path(p0, v0, p1, v1, h, SMALLEST_MARCH), trajectory, start + SMALLEST_MARCH, robot_step
+        )
         if later < gap:
             return 0.0
     while t < end:
@@ -123,7 +125,7 @@ def _closing_bound(v0: Vec, v1: Vec, h: float) -> tuple[float, float]:
     speed = max(norm(v0), norm(v1))
     # Drag and lift factors stay below 2 in every noise profile: 2 (0.55 + 0.27) A |v|^2 bounds the air's part.
     change = h * (GRAVITY + 1.7 * AIR_FACTOR * speed * speed)
-    return speed + change, max(max(-v0[2], -v1[2]), 0.0) + change
+    return speed + change, max(-v0[2], -v1[2], 0.0) + change
 
 
 @kernel
@@ -148,7 +150,11 @@ def _still_touch(p0: Vec, v0: Vec, p1: Vec, v1: Vec, h: float, unused: Array) ->
         t = _march(_TABLE, p0, v0, p1, v1, h, first, falling if over else speed, unused, 0.0, 1.0)
         if t >= 0.0:
             first, what = t, _TABLE
-    if abs(p0[0]) < way + NET_HALF_THICKNESS and low < NET_HEIGHT + BALL_RADIUS and abs(p0[1]) < NET_HALF_WIDTH + way:
+    if (
+        abs(p0[0]) < way + NET_HALF_THICKNESS
+        and low < NET_HEIGHT + BALL_RADIUS
+        and abs(p0[1]) < NET_HALF_WIDTH + way
+    ):
         t = _march(_NET, p0, v0, p1, v1, h, first, speed, unused, 0.0, 1.0)
         if t >= 0.0:
             first, what = t, _NET
@@ -271,7 +277,7 @@ def fly_to_touch(
     Returns:
         Position, velocity, time flown [s], touch and normal, as ``fly_step``.
     """
-    steps = int(math.ceil(duration / GRID_STEP - 1e-9))
+    steps = math.ceil(duration / GRID_STEP - 1e-9)
     flown = 0.0
     what = NONE
     normal = (0.0, 0.0, 0.0)
@@ -283,4 +289,3 @@ def fly_to_touch(
         if what != NONE:
             break
     return pos, vel, flown, what, normal
-

@@ -38,7 +38,9 @@ class ActorCritic(nn.Module):
             training starts from a robot that stands still instead of one that flails.
     """
 
-    def __init__(self, obs_size: int, action_size: int, config: NetworkConfig, home_action: np.ndarray) -> None:
+    def __init__(
+        self, obs_size: int, action_size: int, config: NetworkConfig, home_action: np.ndarray
+    ) -> None:
         super().__init__()
         self.trunk = D2RL(obs_size, config.units)
         self.critic_trunk = D2RL(obs_size, config.units) if config.trunks == "separate" else None

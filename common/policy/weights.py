@@ -104,7 +104,9 @@ def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) ->
         if name not in own:
             raise PolicyError(f"weights hold unknown {name!r}; the network has {', '.join(sorted(own))}")
         if tuple(own[name].shape) != value.shape:
-            raise PolicyError(f"weights {name!r} have shape {value.shape}; allowed is {tuple(own[name].shape)}")
+            raise PolicyError(
+                f"weights {name!r} have shape {value.shape}; allowed is {tuple(own[name].shape)}"
+            )
     network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in tensors.items()})
 
 

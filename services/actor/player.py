@@ -93,7 +93,10 @@ class Player:
         finished: list[FinishedRallies] = []
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
-        value_scale, value_mean = np.float32(np.sqrt(snapshot.value_var + 1e-5)), np.float32(snapshot.value_mean)
+        value_scale, value_mean = (
+            np.float32(np.sqrt(snapshot.value_var + 1e-5)),
+            np.float32(snapshot.value_mean),
+        )
         for t in range(steps):
             started = self._clock()
             obs[t] = self._obs

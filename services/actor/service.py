@@ -216,9 +216,16 @@ class ActorService:
             return
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.set("topspin_stage", snapshot.stage)
-        if mine is None or mine.stage_number != snapshot.stage_number or mine.generation != snapshot.generation:
+        if (
+            mine is None
+            or mine.stage_number != snapshot.stage_number
+            or mine.generation != snapshot.generation
+        ):
             log.info(
-                "policy received generation=%d version=%d stage=%d", snapshot.generation, snapshot.version, snapshot.stage
+                "policy received generation=%d version=%d stage=%d",
+                snapshot.generation,
+                snapshot.version,
+                snapshot.stage,
             )
 
     # ---- rollouts
@@ -319,7 +326,9 @@ class ActorService:
                 self._block += 1
                 return
             time.sleep(0.05)
-        log.warning("waiting for=%r gave up after %.0f s", f"rally block {self._block}", self._config.rally_wait_s)
+        log.warning(
+            "waiting for=%r gave up after %.0f s", f"rally block {self._block}", self._config.rally_wait_s
+        )
 
     # ---- being a service
 

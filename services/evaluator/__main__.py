@@ -6,14 +6,15 @@ import sys
 import time
 from pathlib import Path
 from threading import Event
+from typing import Any
 
 from common.comms.zenoh_transport import open_zenoh
 from common.config import load
 from common.log import set_up_logging
 from common.metrics import Metrics
+from common.policy.weights import load_policy
 from common.process import DONE, run_service
 from common.service_config import new_incarnation
-from common.policy.weights import load_policy
 from services.evaluator.config import EvaluatorConfig
 from services.evaluator.match import evaluation_rallies, play_match
 from services.evaluator.measures import measures
@@ -58,7 +59,12 @@ def play_once(config: EvaluatorConfig) -> None:
     )
     rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
     found = measures(play_match(policy, rallies, env, config.envs))
-    about = {"launch": config.launch, "noise": config.noise, "rounds": config.rounds, "seed": config.seed}
+    about: dict[str, Any] = {
+        "launch": config.launch,
+        "noise": config.noise,
+        "rounds": config.rounds,
+        "seed": config.seed,
+    }
     about |= {"policy": config.policy, "seconds": round(time.monotonic() - started, 2)}
     if config.json_line:
         sys.stdout.write(json.dumps(found | about) + "\n")

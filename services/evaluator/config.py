@@ -13,12 +13,16 @@ class EvaluatorConfig(ServiceConfig):
     """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best."""
 
     policy: str = Field("", description="policy folder to play once; empty: follow the run")
-    rallies: int = Field(1000, ge=1, le=1_000_000, description="rallies to play; in following, of each evaluation")
+    rallies: int = Field(
+        1000, ge=1, le=1_000_000, description="rallies to play; in following, of each evaluation"
+    )
     launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     envs: int = Field(250, ge=1, le=65536, description="environments played together")
-    json_line: bool = Field(False, alias="json", description="print the measures as one JSON object, last line")
+    json_line: bool = Field(
+        False, alias="json", description="print the measures as one JSON object, last line"
+    )
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     folder: str = Field("", description="run folder; empty: runs/RUN")

@@ -1,5 +1,7 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -60,7 +62,14 @@ def play_match(policy: Policy, rallies: RallyBlock, config: EnvConfig, envs: int
             ended.append(step.finished)
             left -= int(step.finished.validated.sum())
 
-    def rated(name: str) -> npt.NDArray[np.generic]:
+    def rated(name: str) -> npt.NDArray[Any]:
         return np.concatenate([getattr(f, name)[f.validated] for f in ended])
 
-    return Played(*(rated(name) for name in ("seeds", "outcomes", "landing_errors", "caught", "over", "returns")))  # type: ignore[arg-type]  # the fields' own dtypes
+    return Played(
+        seeds=rated("seeds"),
+        outcomes=rated("outcomes"),
+        landing_errors=rated("landing_errors"),
+        caught=rated("caught"),
+        over=rated("over"),
+        returns=rated("returns"),
+    )

@@ -57,11 +57,15 @@ def measures(played: Played) -> dict[str, Any]:
     result["target_error_mean"] = round(float(errors.mean()), 4) if landed else None
     half = Z_95 * float(errors.std(ddof=1)) / math.sqrt(landed) if landed > 1 else None
     result["target_error_mean_ci"] = (
-        [round(float(errors.mean()) - half, 4), round(float(errors.mean()) + half, 4)] if half is not None else None
+        [round(float(errors.mean()) - half, 4), round(float(errors.mean()) + half, 4)]
+        if half is not None
+        else None
     )
     result["target_error_median"] = round(float(np.median(errors)), 4) if landed else None
     for limit in WITHIN_M:
         result[f"within_{limit:.1f}_m"] = round(float((errors < limit).mean()), 4) if landed else None
     counts = np.bincount(played.outcomes, minlength=len(Outcome))
-    result["outcomes"] = {outcome.name.lower(): int(counts[outcome]) for outcome in Outcome if counts[outcome]}
+    result["outcomes"] = {
+        outcome.name.lower(): int(counts[outcome]) for outcome in Outcome if counts[outcome]
+    }
     return result

@@ -82,7 +82,9 @@ class EvaluatorService:
         self._alive = transport.declare_alive(keys.alive("evaluator", config.id, incarnation))
         self._folder = RunFolder.of(config.run, config.folder)
         self._folder.report.mkdir(parents=True, exist_ok=True)
-        self._rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, config.env.flight)
+        self._rallies = evaluation_rallies(
+            config.rallies, config.launch, config.noise, config.seed, config.env.flight
+        )
         self._snapshot: PolicySnapshot | None = None
         self._played = (-1, -1)
         self._best: tuple[int, float, float] | None = None
@@ -154,7 +156,9 @@ class EvaluatorService:
             self._refused("policy", error)
             return
         contract = self._contract(snapshot)
-        policy = Policy(self._network, Moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count), contract)
+        policy = Policy(
+            self._network, Moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count), contract
+        )
         env = self._config.env.model_copy(update={"noise": self._config.noise, "rounds": self._config.rounds})
         found = measures(play_match(policy, self._rallies, env, self._config.envs))
         self.evaluations += 1
@@ -188,7 +192,10 @@ class EvaluatorService:
         if self._best is None or reached > self._best:
             self._best = reached
             save_policy(
-                self._folder.best_policy, policy.network, policy.moments, contract.model_copy(update={"measures": found})
+                self._folder.best_policy,
+                policy.network,
+                policy.moments,
+                contract.model_copy(update={"measures": found}),
             )
 
     def _contract(self, snapshot: PolicySnapshot) -> Contract:

@@ -11,12 +11,22 @@ class GeneratorConfig(ServiceConfig):
     """Settings of a generator: which rallies, how many, to which shards."""
 
     launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
-    noise: Literal["off", "standard", "hard"] = Field("standard", description="how far drag and lift are drawn")
+    noise: Literal["off", "standard", "hard"] = Field(
+        "standard", description="how far drag and lift are drawn"
+    )
     flight: Literal["simple", "full"] = Field("simple", description="aerodynamics; must be the actors'")
-    shards: int = Field(1, ge=1, le=4096, description="shards in all: as many as actors, so that a rally is played once")
+    shards: int = Field(
+        1, ge=1, le=4096, description="shards in all: as many as actors, so that a rally is played once"
+    )
     index: int = Field(0, ge=0, description="which of the generators this is")
     of: int = Field(1, ge=1, description="how many generators share the shards")
-    batch: int = Field(128, ge=1, le=1000, description="rallies a message", json_schema_extra={"unit": "rallies"})
+    batch: int = Field(
+        128, ge=1, le=1000, description="rallies a message", json_schema_extra={"unit": "rallies"}
+    )
     rate_hz: float = Field(
-        600.0, gt=0, le=1e6, description="rallies published to each shard", json_schema_extra={"unit": "rallies/s"}
+        600.0,
+        gt=0,
+        le=1e6,
+        description="rallies published to each shard",
+        json_schema_extra={"unit": "rallies/s"},
     )

@@ -30,7 +30,9 @@ class GeneratorService:
         incarnation: Of this life: published streams of different lives share no rally.
     """
 
-    def __init__(self, config: GeneratorConfig, transport: Transport, metrics: Metrics, incarnation: int) -> None:
+    def __init__(
+        self, config: GeneratorConfig, transport: Transport, metrics: Metrics, incarnation: int
+    ) -> None:
         self._config = config
         self._transport = transport
         self._metrics = metrics
@@ -68,7 +70,9 @@ class GeneratorService:
 
     def run(self, stop: Event) -> None:
         """Work until ``stop`` is set."""
-        log.info("generating launch=%s noise=%s shards=%s", self._config.launch, self._config.noise, self._shards)
+        log.info(
+            "generating launch=%s noise=%s shards=%s", self._config.launch, self._config.noise, self._shards
+        )
         while not stop.is_set():
             wait = self.step(time.monotonic())
             if wait > 0:
@@ -97,7 +101,11 @@ class GeneratorService:
             if known:
                 self._paused = command is Command.PAUSE
             request.reply(
-                encode(ControlReply(known, "paused" if self._paused else "running", "" if known else "pause, resume"))
+                encode(
+                    ControlReply(
+                        known, "paused" if self._paused else "running", "" if known else "pause, resume"
+                    )
+                )
             )
 
     def _refuse(self, request: Request, reason: object) -> None:
@@ -149,7 +157,11 @@ class GeneratorService:
             incarnation=self._incarnation,
             time=time.time(),
             state=self.state,
-            counters={"published": float(self._published), "drawn": float(self._drawn), "valid": float(self._valid)},
+            counters={
+                "published": float(self._published),
+                "drawn": float(self._drawn),
+                "valid": float(self._valid),
+            },
             gauges={},
         )
         self._transport.publish(self._keys.status("generator", self._config.id), encode(status), Flow.STATUS)

@@ -84,7 +84,7 @@ def restore(path: Path, training: Training) -> Extras:
         CheckpointError: The file is missing, damaged, or of another network; ``training`` may be half changed.
     """
     try:
-        with safe_open(path, framework="numpy") as file:  # type: ignore[no-untyped-call]  # untyped package
+        with safe_open(path, framework="numpy") as file:
             about = json.loads((file.metadata() or {})["topspin"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:

@@ -15,22 +15,32 @@ from services.learner.ppo import PPOConfig
 class LearnerConfig(ServiceConfig):
     """Settings of the learner; task and network are those its actors must have."""
 
-    mode: Literal["hub", "client"] = Field("hub", description="be the hub that listens at the endpoint, or dial one")
+    mode: Literal["hub", "client"] = Field(
+        "hub", description="be the hub that listens at the endpoint, or dial one"
+    )
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     ppo: PPOConfig = PPOConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
     intake: IntakeConfig = IntakeConfig()
-    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset, as the generators'")
+    launch: Literal["paper", "strong", "match"] = Field(
+        "paper", description="launch preset, as the generators'"
+    )
     folder: str = Field("", description="run folder; empty: runs/RUN")
     resume: bool = Field(False, description="go on from the newest checkpoint in the run folder")
     minutes: float = Field(
-        0.0, ge=0, description="stop this long after the first trained batch; 0: no limit", json_schema_extra={"unit": "min"}
+        0.0,
+        ge=0,
+        description="stop this long after the first trained batch; 0: no limit",
+        json_schema_extra={"unit": "min"},
     )
     frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}
     )
     silence_warning_s: float = Field(
-        10.0, gt=0, description="time without a dataset after which the log says what is missing", json_schema_extra={"unit": "s"}
+        10.0,
+        gt=0,
+        description="time without a dataset after which the log says what is missing",
+        json_schema_extra={"unit": "s"},
     )

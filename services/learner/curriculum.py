@@ -44,7 +44,9 @@ def next_stage(stage: int, epochs_in_stage: int, catch_rate: float, config: Curr
     return stage
 
 
-def learning_rate_bound(stage: int, epochs_in_stage: int, highest: float, lowest: float, config: CurriculumConfig) -> float:
+def learning_rate_bound(
+    stage: int, epochs_in_stage: int, highest: float, lowest: float, config: CurriculumConfig
+) -> float:
     """Return the learning rate's upper bound: constant, then linear to ``lowest`` over the last stage."""
     if stage < 3 or config.stage_3 == 0:
         return highest

@@ -35,7 +35,9 @@ class PPOConfig(BaseModel):
     gae_lambda: float = Field(0.95, ge=0, le=1, description="trace decay of the advantage")
     clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
     mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
-    minibatch: int = Field(4096, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"})
+    minibatch: int = Field(
+        4096, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
+    )
     reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
     value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
     entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
@@ -43,10 +45,17 @@ class PPOConfig(BaseModel):
     gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
     learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
     learning_rate_min: float = Field(1e-4, gt=0, le=0.1, description="lower bound of the adaptation")
-    learning_rate_max: float = Field(1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage")
-    target_kl: float = Field(0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to")
+    learning_rate_max: float = Field(
+        1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage"
+    )
+    target_kl: float = Field(
+        0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to"
+    )
     refit_epochs: int = Field(
-        8, ge=0, le=1000, description="epochs after a stage change in which only the critic learns, the policy held"
+        8,
+        ge=0,
+        le=1000,
+        description="epochs after a stage change in which only the critic learns, the policy held",
     )
 
 
@@ -152,13 +161,15 @@ def update(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
-        for rows in torch.randperm(count, generator=generator).split(config.minibatch):
+        for rows in torch.split(torch.randperm(count, generator=generator), config.minibatch):
             if len(rows) < min(config.minibatch, count) // 2:
                 continue  # a small remainder would weigh as much as a full batch
             mean, values = network(data.obs[rows])
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
             if hold_policy:
-                loss_policy = kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma)
+                loss_policy = kl_divergence(
+                    data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma
+                )
             else:
                 loss_policy = policy_loss(
                     log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
@@ -169,18 +180,22 @@ def update(
             if config.entropy_weight > 0:
                 loss = loss - config.entropy_weight * entropy(network.log_sigma)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]  # torch ships it untyped
+            loss.backward()
             norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
             if not np.isfinite(norm):
                 finite = False
                 continue
             optimizer.step()
             with torch.no_grad():
-                kl = float(
-                    kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma)
-                )
+                kl = float(kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma))
                 outside = ((log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
-            sums += (loss_policy.item(), loss_value.item(), loss_bound.item(), outside.float().mean().item(), norm)
+            sums += (
+                loss_policy.item(),
+                loss_value.item(),
+                loss_bound.item(),
+                outside.float().mean().item(),
+                norm,
+            )
             breathe()
             kl_sum += kl
             steps, batches = steps + 1, batches + 1

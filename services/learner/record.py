@@ -42,8 +42,12 @@ def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, flo
         "explained_variance": update.explained_variance,
         "learning_rate": update.learning_rate,
     }
-    result.update({f"reward_{name}": float(value) for name, value in zip(TERMS, play.reward_terms, strict=True)})
-    result.update({f"outcome_{o.name.lower()}": int(play.outcomes[o]) for o in Outcome if o is not Outcome.NONE})
+    result.update(
+        {f"reward_{name}": float(value) for name, value in zip(TERMS, play.reward_terms, strict=True)}
+    )
+    result.update(
+        {f"outcome_{o.name.lower()}": int(play.outcomes[o]) for o in Outcome if o is not Outcome.NONE}
+    )
     return result
 
 
@@ -67,7 +71,12 @@ class Record:
             writer = csv.DictWriter(file, fieldnames=list(values))
             if is_new:
                 writer.writeheader()
-            writer.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
+            writer.writerow(
+                {
+                    name: f"{value:.6g}" if isinstance(value, float) else value
+                    for name, value in values.items()
+                }
+            )
         self._write_events(values)
 
     def truncate(self, epoch: int) -> None:

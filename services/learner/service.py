@@ -1,13 +1,14 @@
 """The learner's shell: takes rollouts in, trains epochs, broadcasts policies and stage changes, keeps the run."""
 
 import logging
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version as package_version
 from threading import Event
 
-from common.comms.codec import DecodeError, decode, decode_one_of, encode
+from common.comms.codec import DecodeError, decode_one_of, encode
 from common.comms.keys import KeyPartError, Keys
 from common.comms.messages import (
     ActorReport,
@@ -23,7 +24,14 @@ from common.comms.messages import (
 from common.comms.transport import Flow, Transport
 from common.env.robot import home_action
 from common.metrics import Metrics
-from common.policy.weights import ACTION_CONTRACT, OBSERVATION_CONTRACT, Contract, pack, save_policy, task_hash
+from common.policy.weights import (
+    ACTION_CONTRACT,
+    OBSERVATION_CONTRACT,
+    Contract,
+    pack,
+    save_policy,
+    task_hash,
+)
 from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
@@ -66,13 +74,19 @@ class LearnerService:
     """
 
     def __init__(
-        self, config: LearnerConfig, transport: Transport, metrics: Metrics, clock: Callable[[], float] = time.monotonic
+        self,
+        config: LearnerConfig,
+        transport: Transport,
+        metrics: Metrics,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
         self._folder = RunFolder.of(config.run, config.folder)
         self._folder.create()
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
-        self.training = Training(config.ppo, config.network, config.curriculum, home_action(config.env.robot), config.seed)
+        self.training = Training(
+            config.ppo, config.network, config.curriculum, home_action(config.env.robot), config.seed
+        )
         self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._generation = int(time.time())
         self._stages: list[StageChange] = []
@@ -171,7 +185,9 @@ class LearnerService:
             trained_seconds=self.seconds,
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
-        save_policy(self._folder.latest_policy, self.training.network, self.training.obs_moments, self._contract())
+        save_policy(
+            self._folder.latest_policy, self.training.network, self.training.obs_moments, self._contract()
+        )
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
         log.debug("checkpoint written file=%s", path)
 
@@ -209,7 +225,9 @@ class LearnerService:
             reason=reason,
         )
         self._stages.append(change)
-        log.info("stage number=%d stage=%d frames=%d reason=%s", change.number, change.stage, change.frames, reason)
+        log.info(
+            "stage number=%d stage=%d frames=%d reason=%s", change.number, change.stage, change.frames, reason
+        )
 
     def _standing(self) -> Standing:
         progress = self.training.progress
@@ -235,7 +253,12 @@ class LearnerService:
         self._stages = [StageChange(**change) for change in extras.stage_log]
         self._clocks.resumed_seconds = extras.trained_seconds
         self._record.truncate(self.training.progress.epoch)
-        log.info("resumed file=%s epoch=%d frames=%d", files[-1], self.training.progress.epoch, self.training.progress.frames)
+        log.info(
+            "resumed file=%s epoch=%d frames=%d",
+            files[-1],
+            self.training.progress.epoch,
+            self.training.progress.frames,
+        )
         return tuple(Remembered.from_json(values) for values in extras.memory)
 
     # ---- talking
@@ -272,7 +295,9 @@ class LearnerService:
             except KeyPartError as error:
                 self._refused("alive", error)
                 continue
-            (self._alive.add if event.alive else self._alive.discard)((member.role, member.id, member.incarnation))
+            (self._alive.add if event.alive else self._alive.discard)(
+                (member.role, member.id, member.incarnation)
+            )
             if member.role == "actor" and not event.alive:
                 self._intake.gone(member.id, member.incarnation)
         for _ in range(SERVED_AT_ONCE):
@@ -300,7 +325,9 @@ class LearnerService:
             if isinstance(message, ActorReport):
                 request.reply(encode(self._intake.report(message, now)))
                 continue
-            self._paused = message.command is Command.PAUSE or (self._paused and message.command is not Command.RESUME)
+            self._paused = message.command is Command.PAUSE or (
+                self._paused and message.command is not Command.RESUME
+            )
             self._stopping |= message.command in (Command.STOP, Command.DRAIN)
             request.reply(encode(ControlReply(True, self.state, "")))
         while (request := self._policies.poll()) is not None:
@@ -330,7 +357,10 @@ class LearnerService:
             )
         else:
             log.warning(
-                "waiting for=rollouts have=%d of=%d actors=%d", self._intake.queued, self._config.intake.dataset_rollouts, actors
+                "waiting for=rollouts have=%d of=%d actors=%d",
+                self._intake.queued,
+                self._config.intake.dataset_rollouts,
+                actors,
             )
 
     # ---- numbers
@@ -428,7 +458,8 @@ class LearnerService:
             incarnation=self._generation,
             time=time.time(),
             state=self.state,
-            counters={"frames": float(progress.frames)} | {name: float(count) for name, count in fates.items()},
-            gauges={name: float(value) for name, value in gauges.items() if value == value},
+            counters={"frames": float(progress.frames)}
+            | {name: float(count) for name, count in fates.items()},
+            gauges={name: float(value) for name, value in gauges.items() if not math.isnan(value)},
         )
         self._transport.publish(self._keys.status("learner", LEARNER_ID), encode(status), Flow.STATUS)

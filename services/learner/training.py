@@ -97,7 +97,12 @@ class Training:
     """
 
     def __init__(
-        self, ppo: PPOConfig, network: NetworkConfig, curriculum: CurriculumConfig, home_action: Floats, seed: int
+        self,
+        ppo: PPOConfig,
+        network: NetworkConfig,
+        curriculum: CurriculumConfig,
+        home_action: Floats,
+        seed: int,
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
@@ -121,7 +126,9 @@ class Training:
         lengths = (self.curriculum.stage_1, self.curriculum.stage_2, self.curriculum.stage_3)
         return max(1, lengths[self.progress.stage - 1] - self.progress.epochs_in_stage)
 
-    def run_epoch(self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None) -> EpochStats:
+    def run_epoch(
+        self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None
+    ) -> EpochStats:
         """Train one epoch on ``rollouts`` and go on to the next version; their order decides the result's bits.
 
         Args:
@@ -131,7 +138,11 @@ class Training:
         before = self.progress
         data, explained = self._dataset(rollouts)
         bound = learning_rate_bound(
-            before.stage, before.epochs_in_stage, self.ppo.learning_rate_max, self.ppo.learning_rate_min, self.curriculum
+            before.stage,
+            before.epochs_in_stage,
+            self.ppo.learning_rate_max,
+            self.ppo.learning_rate_min,
+            self.curriculum,
         )
         stats = update(
             self.network,
@@ -194,7 +205,15 @@ class Training:
                     ppo.gamma,
                     ppo.gae_lambda,
                 )
-                parts.append((obs, actions, torch.tensor(r.log_mu.reshape(-1)), log_prob(actions, mean, log_sigma), mean))
+                parts.append(
+                    (
+                        obs,
+                        actions,
+                        torch.tensor(r.log_mu.reshape(-1)),
+                        log_prob(actions, mean, log_sigma),
+                        mean,
+                    )
+                )
                 advantages.append(advantage.reshape(-1))
                 returns.append((advantage + values).reshape(-1))
                 values_all.append(values.reshape(-1))
@@ -207,7 +226,14 @@ class Training:
         obs, actions, log_mu, log_prox, mean = (torch.cat(part) for part in zip(*parts, strict=True))
         targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
         data = Dataset(
-            obs, actions, log_mu, log_prox, mean, log_sigma, torch.from_numpy(advantage), torch.from_numpy(targets)
+            obs,
+            actions,
+            log_mu,
+            log_prox,
+            mean,
+            log_sigma,
+            torch.from_numpy(advantage),
+            torch.from_numpy(targets),
         )
         return data, explained
 
@@ -216,4 +242,3 @@ class Training:
             return np.zeros(0, np.float32)
         _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
         return denormalized(value, self.value_moments)
-

@@ -25,7 +25,9 @@ class Deck:
         )
 
 
-def make_env(count: int = 4, config: EnvConfig = QUIET, seed: int = 1, rallies: int = 64, **options) -> RallyEnv:
+def make_env(
+    count: int = 4, config: EnvConfig = QUIET, seed: int = 1, rallies: int = 64, **options
+) -> RallyEnv:
     return RallyEnv(count, config, Deck(draw_rallies(rallies, seed=seed, noise=config.noise)), **options)
 
 

@@ -26,7 +26,9 @@ def gae_by_definition(rewards, values, terminated, truncated, final_values, last
     return result
 
 
-@given(seed=st.integers(0, 10_000), steps=st.integers(1, 12), gamma=st.floats(0.5, 0.999), lam=st.floats(0, 1))
+@given(
+    seed=st.integers(0, 10_000), steps=st.integers(1, 12), gamma=st.floats(0.5, 0.999), lam=st.floats(0, 1)
+)
 def test_gae_equals_its_definition(seed, steps, gamma, lam):
     rng = np.random.default_rng(seed)
     shape = (steps, 4)

@@ -101,7 +101,15 @@ def test_an_update_moves_the_policy_where_the_advantage_points_and_fits_the_valu
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
     config = PPOConfig(minibatch=128, mini_epochs=4)
     stats = [
-        update(network, optimizer, make_data(network, seed=k), config, 1e-3, 1e-3, torch.Generator().manual_seed(k))
+        update(
+            network,
+            optimizer,
+            make_data(network, seed=k),
+            config,
+            1e-3,
+            1e-3,
+            torch.Generator().manual_seed(k),
+        )
         for k in range(25)
     ]
 

@@ -78,7 +78,11 @@ def test_a_stage_change_carries_weights_over_and_resets_the_observation_count_al
     stats = training.run_epoch(dataset(2))
 
     assert stats.stage_changed
-    assert (training.progress.stage, training.progress.stage_number, training.progress.epochs_in_stage) == (2, 1, 0)
+    assert (training.progress.stage, training.progress.stage_number, training.progress.epochs_in_stage) == (
+        2,
+        1,
+        0,
+    )
     assert training.obs_moments.count == 1
     assert training.value_moments.count > values
     assert any(not torch.equal(a, b) for a, b in zip(weights, state(training), strict=True))
@@ -94,7 +98,9 @@ def test_the_first_epochs_of_a_new_stage_teach_the_critic_only():
     curriculum = CURRICULUM.model_copy(update={"stage_2": 50})
 
     def moved(refit_epochs):
-        ppo = PPO.model_copy(update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3})
+        ppo = PPO.model_copy(
+            update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
+        )
         training = Training(ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
         for epoch in range(3):
             training.run_epoch(dataset(epoch))

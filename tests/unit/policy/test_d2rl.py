@@ -27,7 +27,14 @@ def test_every_hidden_layer_after_the_first_sees_the_observation_again():
     with torch.no_grad():
         got = trunk(torch.from_numpy(obs.astype(np.float32))[None])[0].numpy()
 
-    assert [layer.in_features for layer in trunk.layers] == [37, 256 + 37, 128 + 37, 128 + 37, 64 + 37, 64 + 37]
+    assert [layer.in_features for layer in trunk.layers] == [
+        37,
+        256 + 37,
+        128 + 37,
+        128 + 37,
+        64 + 37,
+        64 + 37,
+    ]
     np.testing.assert_allclose(got, by_hand(trunk, obs), atol=2e-5)
 
 
@@ -37,7 +44,9 @@ def test_the_papers_trunk_has_its_published_number_of_parameters():
     assert count == 89_024
 
 
-@pytest.mark.parametrize(("trunks", "parameters"), [("shared", 89_024 + 264 + 7), ("separate", 2 * 89_024 + 264 + 7)])
+@pytest.mark.parametrize(
+    ("trunks", "parameters"), [("shared", 89_024 + 264 + 7), ("separate", 2 * 89_024 + 264 + 7)]
+)
 def test_actor_and_critic_share_all_but_the_last_layers_or_nothing(trunks, parameters):
     network = new_network(NetworkConfig(trunks=trunks))
 
@@ -67,5 +76,6 @@ def test_log_probability_entropy_and_divergence_are_the_gaussians():
     torch.testing.assert_close(log_prob(actions, mean, log_sigma), p.log_prob(actions).sum(-1))
     torch.testing.assert_close(entropy(log_sigma), p.entropy().sum(-1)[0])
     torch.testing.assert_close(
-        kl_divergence(mean, log_sigma, other, log_other), torch.distributions.kl_divergence(p, q).sum(-1).mean()
+        kl_divergence(mean, log_sigma, other, log_other),
+        torch.distributions.kl_divergence(p, q).sum(-1).mean(),
     )
