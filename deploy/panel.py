@@ -148,7 +148,8 @@ def _doing(status: Status) -> str:
     if status.role == "actor":
         return f"{c.get('frames', 0) / 1e6:.2f} M frames, policy {g.get('version', -1):.0f}"
     if status.role == "generator":
-        return f"{c.get('published', 0):,.0f} rallies, {100 * c.get('valid', 0) / max(c.get('drawn', 0), 1):.0f} % valid"
+        valid = 100 * c.get("valid", 0) / max(c.get("drawn", 0), 1)
+        return f"{c.get('published', 0):,.0f} rallies, {valid:.0f} % valid"
     if status.role == "evaluator":
         return f"{c.get('evaluations', 0):.0f} evaluations"
     return f"policy {g.get('version', 0):.0f}, queue {g.get('queued', 0):.0f}"

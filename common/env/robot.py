@@ -160,7 +160,7 @@ class RobotBatch:
             out=self._records,
         )
         r = self._records
-        # MuJoCo resets a simulation that meets NaN or huge numbers, and rollout stops it: its time falls behind.
+        # MuJoCo resets a simulation that meets NaN or huge numbers, and stops its rollout: its time falls behind.
         behind = self._clock + self.substeps * self.step_s - self._time.reshape(-1)
         self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
         if self.faulty.size:

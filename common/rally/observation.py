@@ -17,7 +17,7 @@ class Part(NamedTuple):
 
 
 OBSERVATION: tuple[Part, ...] = (
-    Part("joint_pos", 7, "m, rad", -2.9, 2.9, "rail_x, rail_y, yaw, pitch, elbow, wrist, roll"),
+    Part("joint_pos", 7, "m, rad", -3.2, 3.2, "rail_x, rail_y, yaw, pitch, elbow, wrist, roll"),
     Part("joint_vel", 7, "m/s, rad/s", -60.0, 60.0, "the same joints' velocities"),
     Part("racket_pos", 3, "m", -3.0, 2.0, "racket centre, world"),
     Part("racket_quat", 4, "-", -1.0, 1.0, "racket frame (w, x, y, z), w >= 0, near (1, 0, 0, 0) at home"),

@@ -1,0 +1,48 @@
+"""A whole run in one process: generator, two actors, learner and evaluator over real Zenoh."""
+
+import csv
+import json
+
+from theatre import stage, wait_until
+
+from common.policy.weights import load_policy
+
+FATES = ("trained", "refused", "dropped", "in_flight", "lost")
+
+
+def ledger(scraped):
+    return {
+        fate: scraped[f'topspin_ledger_rollouts{{fate="{fate}"}}'] for fate in ("published", *FATES)
+    }
+
+
+def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_path):
+    with stage(tmp_path) as s:
+        learner = s.learner()  # the hub: it must listen before the others dial it
+        generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
+        wait_until(lambda: learner.service.training.progress.stage == 3, 60, "stage 3")
+        wait_until(
+            lambda: all(actor.scrape()["topspin_stage"] == 3 for actor in actors), 20, "both actors in stage 3"
+        )
+        wait_until(lambda: evaluator.service.evaluations >= 1, 30, "an evaluation")
+        scraped = [entry.scrape() for entry in (generator, *actors, learner, evaluator)]
+        learner.join(60)
+        for entry in (*actors, evaluator, generator):
+            entry.end()
+        progress, final = learner.service.training.progress, learner.service.ledger()
+
+    assert all(any(name.startswith("topspin_process_up") for name in metrics) for metrics in scraped)
+    seen = ledger(scraped[3])
+    assert seen["published"] == sum(seen[fate] for fate in FATES)
+    assert final.balance == 0
+    assert (final.lost, final.dropped) == (0, 0)
+    assert final.trained == 2 * 8
+    assert (progress.epoch, progress.stage, progress.stage_number) == (8, 3, 2)
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # a row tells the stage after its epoch: three of stage 1 end with the change to 2
+    assert [int(row["stage"]) for row in rows] == [1, 1, 2, 2, 3, 3, 3, 3]
+    assert max(float(row["lag"]) for row in rows) <= 2
+    assert load_policy(tmp_path / "policy" / "latest").contract.version == 8
+    assert json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
+    assert list((tmp_path / "tb").iterdir())

@@ -1,0 +1,252 @@
+"""The MuJoCo robot: converged at its step, fast as stated, limited as stated, and pushed by the ball."""
+
+import logging
+
+import mujoco
+import numpy as np
+import pytest
+
+from common.env.robot import (
+    JOINTS,
+    MAX_ACTION_LATENCY,
+    MUJOCO_STEP,
+    RACKET_BODY,
+    USST_SPEED_LIMITS,
+    RobotBatch,
+    home_action,
+    load_model,
+)
+from common.physics.arm import racket_motion, racket_pose, racket_quaternion
+from common.rally.noise import PROFILES
+
+FINE_STEP = 0.00025  # s: sixteen times finer than the robot's
+HOME = home_action().astype(np.float64)
+STILL = np.zeros((1, 7))
+ONE = np.zeros(1, np.int64)
+
+
+def make_strokes(count: int = 64, steps: int = 20, seed: int = 0) -> np.ndarray:
+    """Return smooth full strokes as a policy plays them: (steps, count, 7) actions at 50 Hz.
+
+    In 0.2 s back by up to a third of each joint's range, in 0.2 s forward as far beyond home, along minimum-jerk
+    curves: the racket reaches 4 m/s.
+    """
+    rng = np.random.default_rng(seed)
+    back, front = HOME + 0.35 * rng.uniform(-1, 1, (2, count, 7)) * [1, 1, 0.4, 0.4, 0.4, 0.5, 0.4]
+    s = np.arange(1, steps // 2 + 1)[:, None, None] / (steps // 2)
+    blend = s**3 * (10 - 15 * s + 6 * s * s)
+    return np.concatenate([HOME + (back - HOME) * blend, back + (front - back) * blend])
+
+
+def racket_errors(actions: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far [m] and how much [rad] the racket differs from a robot of FINE_STEP, at every control step."""
+    coarse, fine = (RobotBatch(actions.shape[1], step=h) for h in (step, FINE_STEP))
+    distances, turns = [], []
+    for action in actions:
+        coarse.step(action)
+        fine.step(action)
+        for a, b in zip(coarse.joint_pos, fine.joint_pos, strict=True):
+            distances.append(
+                np.linalg.norm(np.subtract(racket_pose(tuple(a)).centre, racket_pose(tuple(b)).centre))
+            )
+            cosine = np.dot(racket_quaternion(tuple(a)), racket_quaternion(tuple(b)))
+            turns.append(2.0 * np.arccos(np.clip(abs(cosine), 0.0, 1.0)))
+    return np.array(distances), np.array(turns)
+
+
+def racket_speed(robot: RobotBatch) -> float:
+    return float(np.linalg.norm(racket_motion(tuple(robot.joint_pos[0]), tuple(robot.joint_vel[0]))[0]))
+
+
+def drive(robot: RobotBatch, action: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
+    """Return each joint's greatest speed and the racket's under a constant action."""
+    joints, racket = np.zeros(7), 0.0
+    for _ in range(steps):
+        robot.step(action[None])
+        joints = np.maximum(joints, np.abs(robot.joint_vel[0]))
+        racket = max(racket, racket_speed(robot))
+    return joints, racket
+
+
+def test_the_time_step_is_converged_over_full_strokes():
+    """4 ms against 0.25 ms: racket mean 1.4 mm and 4 mrad, at most 5.1 mm and 27 mrad (measured).
+
+    A ball is 40 mm across, the camera's noise is 3 mm, and the error is the same in training and evaluation: a
+    policy can't see it. Commands that jump through half a range, so that every drive saturates, come to mean 5 mm.
+    """
+    distances, turns = racket_errors(make_strokes(), MUJOCO_STEP)
+
+    assert distances.mean() < 0.002
+    assert distances.max() < 0.007
+    assert turns.mean() < 0.006
+    assert turns.max() < 0.035
+
+
+def test_the_error_of_the_time_step_falls_in_proportion_to_it():
+    strokes = make_strokes(count=16)
+    whole, half = (racket_errors(strokes, step)[0].mean() for step in (0.004, 0.002))
+
+    # first order against a reference of h/16: (4 - .25)/(2 - .25) = 2.1
+    assert whole / half == pytest.approx(2.1, abs=0.5)
+
+
+def test_the_racket_reaches_8_to_9_m_per_s():
+    robot = RobotBatch(1)
+    drive(robot, np.array([-1, 0, 0, -0.6, -0.35, -0.4, 0]), steps=60)
+    _, racket = drive(robot, np.array([1, 0, 0, 0.9, 0.7, 0.9, 0]), steps=25)
+
+    assert racket > 8.0
+
+
+def test_the_robot_gets_three_quarters_of_a_metre_sideways_in_four_tenths_of_a_second():
+    robot = RobotBatch(1)
+    aside = HOME.copy()
+    aside[1] = 0.9
+    drive(robot, aside, steps=20)
+
+    assert abs(robot.joint_pos[0, 1]) > 0.70
+
+
+def test_joints_stay_within_their_ranges_under_the_widest_commands():
+    """MuJoCo's limits are springs: flung into its stop by bang-bang commands a joint overshoots (measured:
+    4 mm, and 0.19 rad of the pitch, which carries the whole arm at 13 rad/s)."""
+    overshoot = np.array([0.01, 0.01, 0.25, 0.25, 0.25, 0.25, 0.25])
+    rng = np.random.default_rng(0)
+    robot = RobotBatch(64)
+    low, high = np.array(robot.model.jnt_range).T
+    for _ in range(15):
+        action = rng.choice([-1.0, 1.0], (64, 7))
+        for _ in range(10):
+            robot.step(action)
+
+            assert np.all(robot.joint_pos > low - overshoot)
+            assert np.all(robot.joint_pos < high + overshoot)
+
+
+@pytest.mark.parametrize("joint", range(7), ids=JOINTS)
+def test_usst_joints_keep_to_the_published_speeds(joint):
+    """Each alone, to both stops; 10 %: gravity and the arm beyond a joint may push where the drive can't."""
+    for side in (-1.0, 1.0):
+        robot = RobotBatch(1, "usst")
+        action = HOME.copy()
+        action[joint] = side
+        joints, _ = drive(robot, action, steps=60)
+
+        assert joints[joint] <= 1.10 * USST_SPEED_LIMITS[joint]
+
+
+def test_usst_is_slower_than_rails_in_no_load_speed_and_equal_otherwise():
+    ours, theirs = load_model("rails"), load_model("usst")
+
+    np.testing.assert_allclose(theirs.actuator_forcerange[:, 1] / theirs.dof_damping, USST_SPEED_LIMITS)
+    assert np.all(theirs.dof_damping > ours.dof_damping)
+    np.testing.assert_array_equal(theirs.body_mass, ours.body_mass)
+    np.testing.assert_array_equal(theirs.jnt_range, ours.jnt_range)
+
+
+def test_forces_stay_within_the_actuators_limits():
+    robot = RobotBatch(4)
+    motion = robot.step(np.ones((4, 7)))
+
+    assert np.all(np.abs(motion.torque) <= robot.torque_limit * (1 + 1e-12))
+
+
+@pytest.mark.parametrize("control_rate_hz", [50, 200])
+def test_an_impulse_arrives_at_the_racket_over_one_control_step(control_rate_hz):
+    """Without drives, friction of the joints and with gravity in both: M dv = J^T impulse."""
+    impulse = np.array([[-0.03, 0.01, 0.02, 1e-4, -5e-4, 2e-4]])
+    pushed, free = (RobotBatch(1, control_rate_hz=control_rate_hz) for _ in range(2))
+    for robot in (pushed, free):
+        robot.set_gains(ONE, np.zeros((1, 3, 7)), np.zeros(1))
+    inertia, data = np.empty((7, 7)), pushed.batch.get_data(0)
+    linear, angular = np.empty((3, 7)), np.empty((3, 7))
+    mujoco.mj_forward(pushed.model, data)
+    mujoco.mj_fullM(pushed.model, data, inertia)
+    mujoco.mj_jacBody(pushed.model, data, linear, angular, pushed.model.body(RACKET_BODY).id)
+    momentum = linear.T @ impulse[0, :3] + angular.T @ impulse[0, 3:]
+    pushed.push_racket(impulse)
+    for robot in (pushed, free):
+        robot.step(HOME[None])
+    dv = pushed.joint_vel[0] - free.joint_vel[0]
+
+    # the arm falls and turns a little meanwhile: at 50 Hz M and J change by some percent
+    scale = np.abs(momentum).max()
+    np.testing.assert_allclose(
+        inertia @ dv, momentum, rtol=0, atol=scale * (0.06 if control_rate_hz == 50 else 0.01)
+    )
+
+
+def test_an_impulse_is_given_once():
+    impulse = np.array([[-0.03, 0.0, 0.01, 0.0, 0.0, 0.0]])
+    robot = RobotBatch(1)
+    wrench = robot.batch.bind("xfrc_applied")[0, robot.model.body(RACKET_BODY).id]
+    robot.push_racket(impulse)
+    force = wrench.copy()
+    robot.step(HOME[None])
+    robot.push_racket(np.zeros((1, 6)))
+
+    np.testing.assert_allclose(force * robot.substeps * robot.step_s, impulse[0])
+    np.testing.assert_array_equal(wrench, 0.0)
+
+
+def test_home_is_held():
+    robot = RobotBatch(1)
+    drive(robot, HOME, steps=50)
+
+    # kp / gravity: the wrist sags by its torque over 80 Nm/rad
+    np.testing.assert_allclose(robot.joint_pos[0], robot.home, atol=0.02)
+
+
+def test_a_higher_gain_tracks_closer():
+    stiff, soft = RobotBatch(1), RobotBatch(1)
+    soft.set_gains(ONE, np.array([[[0.5] * 7, [1.0] * 7, [1.0] * 7]]), np.zeros(1))
+    action = HOME + 0.05
+    for robot in (stiff, soft):
+        robot.step(action[None])
+    goal = stiff.middle + stiff.half_range * action
+
+    assert np.all(np.abs(stiff.joint_pos[0] - goal) < np.abs(soft.joint_pos[0] - goal))
+
+
+@pytest.mark.parametrize("control_rate_hz", [50, 200])
+def test_an_action_acts_a_latency_late(control_rate_hz):
+    """Also where the latency is longer than the control period, as at 200 Hz."""
+    prompt, late = (RobotBatch(1, control_rate_hz=control_rate_hz) for _ in range(2))
+    late.set_gains(ONE, np.ones((1, 3, 7)), np.array([0.020]))
+    delay = round(0.020 * control_rate_hz)
+    home = np.tile(late.home_action, (delay, 1, 1))
+    actions = late.home_action + 0.1 * np.random.default_rng(0).standard_normal((12, 1, 7))
+    for told, acted in zip(actions, np.concatenate([home, actions]), strict=False):
+        late.step(told)
+        prompt.step(acted)
+
+    np.testing.assert_array_equal(late.joint_pos, prompt.joint_pos)
+
+
+def test_targets_are_remembered_as_long_as_any_profile_may_be_late():
+    assert max(noise.action_latency[1] for noise in PROFILES.values()) <= MAX_ACTION_LATENCY
+
+
+@pytest.mark.parametrize("broken", [np.nan, 1e12])
+def test_a_robot_that_mujoco_gives_up_on_goes_home(broken, caplog, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log file of its warnings
+    robot = RobotBatch(3)
+    robot.step(np.tile(HOME, (3, 1)))
+    robot.joint_vel[1, 2] = broken
+    with caplog.at_level(logging.WARNING):
+        motion = robot.step(np.tile(HOME, (3, 1)))
+
+    np.testing.assert_array_equal(robot.faulty, [1])
+    np.testing.assert_array_equal(robot.joint_pos[1], robot.home)
+    np.testing.assert_array_equal(motion.joint_pos[1], np.tile(robot.home, (5, 1)))
+    assert np.isfinite(motion.torque).all()
+    assert "robots sent home after a simulation fault count=1 first=1" in caplog.text
+    assert robot.step(np.tile(HOME, (3, 1))).joint_pos.shape == (3, 5, 7)
+    assert robot.faulty.size == 0
+
+
+def test_a_control_period_that_the_step_does_not_divide_is_refused():
+    with pytest.raises(
+        ValueError, match=r"control period 0.02 s is not a multiple of the MuJoCo step 0.003 s"
+    ):
+        RobotBatch(1, step=0.003)
