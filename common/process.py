@@ -42,26 +42,22 @@ STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
 _EXIT_WITHIN_S: Final = 10.0
 
 
-def run_service(
-    prog: str, main: Callable[[threading.Event], int], known: tuple[type[Exception], ...] = ()
-) -> int:
+def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
     """Return the exit status of ``main``, which is given the event that SIGINT and SIGTERM set.
 
     Args:
         prog: How the program is called; starts the line of an error.
         main: The service: returns its status, raises what it can't handle.
-        known: Errors of this service, besides those above, that one line tells all about.
     """
     stop = stop_on_signals()
-    status_of = STATUS_OF_ERROR | dict.fromkeys(known, FAILED)
     try:
         status = main(stop)
     except HelpRequest as request:
         sys.stdout.write(str(request))
         status = DONE
-    except tuple(status_of) as error:
+    except tuple(STATUS_OF_ERROR) as error:
         sys.stderr.write(f"{prog}: {error}\n")
-        status = next(code for kind, code in status_of.items() if isinstance(error, kind))
+        status = next(code for kind, code in STATUS_OF_ERROR.items() if isinstance(error, kind))
     except Exception:
         log.exception("stopped by a bug")
         status = FAILED

@@ -48,9 +48,12 @@ def test_a_known_error_is_one_line_and_a_status(capsys, error, status, line):
     assert capsys.readouterr().err == line
 
 
-def test_a_service_may_have_known_errors_of_its_own(capsys):
-    assert run_service("learner", raising(KeyError("checkpoint")), known=(KeyError,)) == 1
-    assert capsys.readouterr().err == "learner: 'checkpoint'\n"
+def test_a_service_may_have_reported_errors_of_its_own(capsys):
+    class CheckpointError(ReportedError):
+        pass
+
+    assert run_service("learner", raising(CheckpointError("checkpoint x is not readable"))) == 1
+    assert capsys.readouterr().err == "learner: checkpoint x is not readable\n"
 
 
 def test_help_goes_to_stdout_and_is_no_error(capsys):

@@ -1,0 +1,198 @@
+"""What Gymnasium asks of an environment, of the single one and of the batch."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector
+
+from common.env.gym import ENV_ID
+from common.env.rally_env import EnvConfig
+from common.rally.trajectory import Outcome
+from tests.unit.env.rallies import make_env
+
+
+def make(**settings) -> gymnasium.Env:
+    return gymnasium.make(ENV_ID, **settings)
+
+
+def make_vec(num_envs: int = 8, **settings) -> gymnasium.vector.VectorEnv:
+    return gymnasium.make_vec(ENV_ID, num_envs=num_envs, **settings)
+
+
+def play(env: gymnasium.Env, steps: int, seed: int = 0) -> list[np.ndarray]:
+    """Return the observations of random play, episode after episode."""
+    env.action_space.seed(seed)
+    obs, _ = env.reset(seed=seed)
+    seen = [obs]
+    for _ in range(steps):
+        obs, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        seen.append(obs)
+        if terminated or truncated:
+            seen.append(env.reset()[0])
+    return seen
+
+
+def test_gymnasiums_own_checker_finds_nothing_to_warn_of():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make().unwrapped)
+
+
+def test_random_play_through_all_wrappers_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        play(make(), 100)
+
+
+@pytest.mark.parametrize("noise", ["off", "standard", "hard"])
+def test_every_observation_lies_in_the_space(noise):
+    env = make(noise=noise)
+
+    assert all(env.observation_space.contains(obs) for obs in play(env, 200))
+
+
+def test_the_spaces_are_the_layouts():
+    env = make()
+
+    assert env.observation_space.shape == (37,)
+    assert env.observation_space.dtype == np.float32
+    np.testing.assert_array_equal(env.action_space.low, [-1] * 7)
+    np.testing.assert_array_equal(env.action_space.high, [1] * 7)
+
+
+def test_a_seed_decides_all_that_follows():
+    one, two, other = play(make(), 150, seed=5), play(make(), 150, seed=5), play(make(), 150, seed=6)
+
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one[0], other[0])
+
+
+def test_resets_without_a_seed_bring_new_rallies():
+    env = make()
+    first, _ = env.reset(seed=1)
+    second, _ = env.reset()
+
+    assert not np.array_equal(first, second)
+
+
+def test_an_episodes_last_observation_is_its_own_and_the_reset_brings_the_next():
+    env = make(noise="off")
+    env.reset(seed=1)
+    terminated = truncated = False
+    while not (terminated or truncated):
+        obs, _, terminated, truncated, info = env.step(env.unwrapped._table.env.home_action)
+    ball = env.unwrapped._next_obs[0, 24:27]
+
+    assert not np.allclose(obs[24:27], ball)
+    assert Outcome(info["outcome"]) not in (Outcome.NONE, Outcome.TIME_OUT)
+    np.testing.assert_array_equal(env.reset()[0][24:27], ball)
+
+
+def test_a_step_beyond_an_episodes_end_is_refused():
+    env = make(time_limit_s=0.2).unwrapped
+    env.reset(seed=1)
+    for _ in range(10):
+        env.step(np.zeros(7, np.float32))
+
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"step\(\) after the episode's end"):
+        env.step(np.zeros(7, np.float32))
+
+
+@pytest.mark.parametrize("made", [lambda: make().unwrapped, make_vec], ids=["single", "batch"])
+def test_a_step_before_reset_is_refused(made):
+    env = made()
+
+    with pytest.raises(gymnasium.error.ResetNeeded, match=r"step\(\) before reset\(\)"):
+        env.step(np.zeros(env.action_space.shape, np.float32))
+
+
+def test_the_batch_states_that_it_resets_in_the_same_step():
+    assert make_vec().metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+
+
+def test_the_batch_has_the_spaces_of_its_environments():
+    envs = make_vec(5)
+    obs, info = envs.reset(seed=1)
+
+    assert envs.single_observation_space == make().observation_space
+    assert envs.observation_space.contains(obs)
+    assert envs.action_space.shape == (5, 7)
+    assert info == {}
+
+
+def test_the_batch_hands_over_last_observation_and_facts_in_gymnasiums_form():
+    """As SyncVectorEnv with SAME_STEP would: objects by row, None elsewhere, masks with an underscore."""
+    envs = make_vec(8, noise="off", time_limit_s=0.5)
+    envs.reset(seed=1)
+    ends = 0
+    for _ in range(60):
+        obs, rewards, terminated, truncated, infos = envs.step(np.zeros((8, 7), np.float32))
+        ended = terminated | truncated
+        assert ("final_obs" in infos) == ended.any()
+        if not ended.any():
+            continue
+        ends += ended.sum()
+        np.testing.assert_array_equal(infos["_final_obs"], ended)
+        np.testing.assert_array_equal(infos["_final_info"], ended)
+        for row in range(8):
+            final = infos["final_obs"][row]
+            assert (final is not None) == ended[row]
+            if ended[row]:
+                assert envs.single_observation_space.contains(final)
+                assert not np.array_equal(final, obs[row])
+                assert (infos["final_info"]["outcome"][row] == Outcome.TIME_OUT) == truncated[row]
+
+    assert ends >= 8
+    assert rewards.dtype == np.float64
+
+
+def test_the_single_environment_plays_as_a_batch_of_one():
+    single, batch = make(), make_vec(1)
+    a, _ = single.reset(seed=3)
+    b, _ = batch.reset(seed=3)
+    np.testing.assert_array_equal(a, b[0])
+    for _ in range(80):
+        action = np.zeros(7, np.float32)
+        a, reward, terminated, truncated, _ = single.step(action)
+        b, rewards, terminations, truncations, infos = batch.step(action[None])
+
+        assert (reward, terminated, truncated) == (rewards[0], terminations[0], truncations[0])
+        np.testing.assert_array_equal(a, infos["final_obs"][0] if "final_obs" in infos else b[0])
+        if terminated or truncated:
+            a, _ = single.reset()
+            np.testing.assert_array_equal(a, b[0])
+
+
+def test_gymnasiums_episode_statistics_work_on_the_batch():
+    envs = vector.RecordEpisodeStatistics(make_vec(8, time_limit_s=0.2))
+    envs.reset(seed=1)
+    for _ in range(10):
+        *_, infos = envs.step(np.zeros((8, 7), np.float32))
+
+    assert "final_info" in infos
+
+
+def test_settings_reach_the_environment():
+    env = make(stage=1, noise="off", control_rate_hz=200).unwrapped
+    env.reset(seed=1)
+
+    assert env._table.env.config == EnvConfig(noise="off", control_rate_hz=200)
+    assert env._table.env.stage == 1
+
+
+def test_an_unknown_setting_is_refused():
+    with pytest.raises(ValueError, match="noize"):
+        make(noize="off")
+
+
+def test_the_batch_plays_as_the_environment_behind_it():
+    envs = make_vec(4, noise="off", stage=1)
+    envs.reset(seed=1)
+    inner = envs.unwrapped._table.env
+
+    assert inner.count == 4
+    assert inner.home_action.shape == make_env(1).home_action.shape
