@@ -84,7 +84,7 @@ def _facts(finished: FinishedRallies) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-class RallyGymEnv(gymnasium.Env[Floats, Floats]):
+class RallyGymEnv(gymnasium.Env[Any, Any]):
     """One robot, one ball.
 
     Args:
@@ -130,7 +130,7 @@ class RallyGymEnv(gymnasium.Env[Floats, Floats]):
         return _within(obs[0]), float(step.reward[0]), bool(step.terminated[0]), bool(step.truncated[0]), info
 
 
-class RallyVectorEnv(VectorEnv[Floats, Floats, npt.NDArray[Any]]):
+class RallyVectorEnv(VectorEnv[Any, Any, Any]):
     """A batch of robots in one simulation call.
 
     Args:

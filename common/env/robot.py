@@ -39,10 +39,15 @@ def load_model(preset: RobotPreset = "rails", step: float = MUJOCO_STEP) -> mujo
     """
     model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
     model.opt.timestep = step
+    limit_speeds(model, preset)
+    return model
+
+
+def limit_speeds(model: mujoco.MjModel, preset: RobotPreset) -> None:
+    """Slow the robot's joints down to what a preset allows, in place."""
     if preset == "usst":
         for joint, limit in enumerate(USST_SPEED_LIMITS):
             model.dof_damping[joint] = model.actuator_forcerange[joint, 1] / limit
-    return model
 
 
 def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
@@ -65,6 +70,7 @@ class RobotBatch:
         control_rate_hz: Control steps a second; its period must be a multiple of MuJoCo's step.
         step: MuJoCo's time step [s]; None: the default for this control rate.
         threads: MuJoCo threads; 1 keeps an actor on one core.
+        model: A model whose first seven joints and actuators are the robot's, in place of the robot alone.
     """
 
     def __init__(
@@ -74,6 +80,7 @@ class RobotBatch:
         control_rate_hz: float = 50.0,
         step: float | None = None,
         threads: int = 1,
+        model: mujoco.MjModel | None = None,
     ) -> None:
         period = 1.0 / control_rate_hz
         if step is None:
@@ -87,10 +94,10 @@ class RobotBatch:
             raise ValueError(f"control period {period} s is not a multiple of the MuJoCo step {step} s")
         self.step_s = step
         self.count = count
-        self.model = load_model(preset, step)
+        self.model = load_model(preset, step) if model is None else model
         self.batch = Batch(self.model, count, threads)
-        self.joint_pos: Array = self.batch.bind("qpos")
-        self.joint_vel: Array = self.batch.bind("qvel")
+        self.joint_pos: Array = self.batch.bind("qpos")[:, :7]
+        self.joint_vel: Array = self.batch.bind("qvel")[:, :7]
         self._ctrl: Array = self.batch.bind("ctrl")
         self._wrench: Array = self.batch.bind("xfrc_applied")
         self._racket = self.model.body(RACKET_BODY).id
@@ -98,12 +105,12 @@ class RobotBatch:
         self.middle: Array = limits.mean(axis=1)
         self.half_range: Array = limits[:, 1] - self.middle
         self.torque_limit: Array = np.array(self.model.actuator_forcerange[:, 1])
-        self.home: Array = np.array(self.model.key("home").qpos)
+        self.home: Array = np.array(self.model.key("home").qpos[:7])
         self.home_action: Array = (self.home - self.middle) / self.half_range
         # Gains and damping differ from rally to rally.
         self._kp: Array = np.array(self.model.actuator_gainprm[:, 0])
         self._kv: Array = -np.array(self.model.actuator_biasprm[:, 2])
-        self._damping_nominal: Array = np.array(self.model.dof_damping)
+        self._damping_nominal: Array = np.array(self.model.dof_damping[:7])
         self._gain: Array = self.batch.expand("actuator_gainprm")
         self._bias: Array = self.batch.expand("actuator_biasprm")
         self._damping: Array = self.batch.expand("dof_damping")
@@ -131,7 +138,7 @@ class RobotBatch:
         self._gain[rows, :, 0] = kp
         self._bias[rows, :, 1] = -kp
         self._bias[rows, :, 2] = -self._kv * factors[:, 1]
-        self._damping[rows] = self._damping_nominal * factors[:, 2]
+        self._damping[rows, :7] = self._damping_nominal * factors[:, 2]
         self._late_substeps[rows] = np.rint(action_latency / self.step_s).astype(np.int64)
 
     def push_racket(self, impulse: Array) -> None:
@@ -152,14 +159,7 @@ class RobotBatch:
             np.copyto(self._control, held[:, None, :], where=late[:, :, None])
         self._held[1:] = self._held[:-1]
         self._held[0] = target
-        self._records = self.batch.rollout(
-            self.substeps,
-            control=self._control,
-            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-            record=("qpos", "actuator_force", "sensordata"),
-            out=self._records,
-        )
-        r = self._records
+        r = self._records = self._advance(self._control)
         # MuJoCo resets a simulation that meets NaN or huge numbers, and stops its rollout: its time falls behind.
         behind = self._clock + self.substeps * self.step_s - self._time.reshape(-1)
         self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
@@ -167,11 +167,22 @@ class RobotBatch:
             self._recover(self.faulty)
         return Motion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)
 
+    def _advance(self, control: Array) -> dict[str, Array]:
+        """Return records (B, substeps, ...) of a control step under joint targets (B, substeps, 7)."""
+        records: dict[str, Array] = self.batch.rollout(
+            self.substeps,
+            control=control,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=("qpos", "actuator_force", "sensordata"),
+            out=self._records,
+        )
+        return records
+
     def _recover(self, rows: Rows) -> None:
         """Stand robots ``rows`` at home, at rest, as if they had been there for the whole control step."""
         log.warning("robots sent home after a simulation fault count=%d first=%d", rows.size, rows[0])
         self.go_home(rows, np.zeros((rows.size, 7)))
         self._start[rows] = self.home
-        self._records["qpos"][rows] = self.home
+        self._records["qpos"][rows, :, :7] = self.home
         self._records["actuator_force"][rows] = 0.0
         self._records["sensordata"][rows] = 0.0

@@ -90,7 +90,7 @@ def unpack(network: ActorCritic, blob: bytes) -> None:
     """Load a blob of ``pack`` into ``network``; raises PolicyError where it doesn't fit."""
     try:
         tensors = load_tensors(blob)
-    except (SafetensorError, ValueError) as error:
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a dtype that numpy lacks
         raise PolicyError(f"weights are not readable as safetensors: {error}") from None
     load_state(network, tensors)
 
@@ -107,7 +107,18 @@ def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) ->
             raise PolicyError(
                 f"weights {name!r} have shape {value.shape}; allowed is {tuple(own[name].shape)}"
             )
+        if not np.isfinite(value).all():
+            raise PolicyError(f"weights {name!r} are not finite")
     network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in tensors.items()})
+
+
+def observation_moments(mean: npt.NDArray[np.float64], var: npt.NDArray[np.float64], count: int) -> Moments:
+    """Return the moments that came with a policy; raises PolicyError if they are not an observation's."""
+    if not mean.shape == var.shape == (OBSERVATION_SIZE,):
+        raise PolicyError(
+            f"observation moments of shapes {mean.shape} and {var.shape}; allowed is ({OBSERVATION_SIZE},)"
+        )
+    return Moments(mean, var, count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +173,7 @@ def load_policy(folder: Path) -> Policy:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise PolicyError(f"{folder / CONTRACT_FILE}: {where or 'file'}: {first['msg']}") from None
-    except (SafetensorError, ValueError) as error:
+    except (SafetensorError, ValueError, KeyError) as error:
         raise PolicyError(f"{folder / WEIGHTS_FILE} is not readable as safetensors: {error}") from None
     expected = json.loads(json.dumps([OBSERVATION_CONTRACT, ACTION_CONTRACT]))
     found = json.loads(json.dumps([contract.observation, contract.action]))
@@ -174,7 +185,7 @@ def load_policy(folder: Path) -> Policy:
     for name in (_OBS_MEAN, _OBS_VAR, _OBS_COUNT):
         if name not in tensors:
             raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
-    moments = Moments(tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)))
+    moments = observation_moments(tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)))
     network = new_network(contract.network)
     load_state(network, tensors)
     return Policy(network, moments, contract)

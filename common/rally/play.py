@@ -24,7 +24,7 @@ from common.physics.fly import fly_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
-from common.physics.vec import axpy, cross, dot, norm, scale, sub
+from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
@@ -95,6 +95,20 @@ class Step(NamedTuple):
     terms: Array  # (B, 8) reward.TERMS
     outcome: Integers  # (B,) trajectory.Outcome
     impulse: Array  # (B, 6) [N s, N m s] impulse of the ball on the racket, and its moment about the centre
+
+
+class Flown(NamedTuple):
+    """Where a ball came to in one control step, and what it met on its way."""
+
+    pos: Vec
+    vel: Vec
+    spin: Vec
+    state: int
+    outcome: int  # trajectory.Outcome; 0: goes on
+    bounced: bool  # tau_1 was met
+    hit: bool  # tau_2 was met
+    landed: bool  # tau_3 was met
+    racket_speed: float  # [m/s] v of the reward, where hit
 
 
 def allocate(count: int) -> tuple[Rallies, Step]:
@@ -175,29 +189,61 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
 
 
 @kernel
-def _play_one(
-    rallies: Rallies,
-    b: int,
-    motion: Motion,
-    actions: Array,
-    rules: Rules,
-    noise: NoiseProfile,
-    path: Array,
-    step: Step,
-) -> None:
-    """Play ball b for one control step. ``path`` (n + 1, 7) is scratch for the robot's joints."""
-    substeps = motion.joint_pos.shape[1]
+def judge(rallies: Rallies, b: int, state: int, what: int, pos: Vec, rules: Rules) -> tuple[int, int]:
+    """Return the state that a touch leads to and the outcome (0: the rally goes on); keep what the touch decides.
+
+    Args:
+        rallies: Row b is written.
+        b: Row.
+        state: State before the touch.
+        what: ``touch.Touch``.
+        pos: Ball's position [m] at the touch.
+        rules: The rules.
+    """
+    following = rules.transitions[state, what]
+    if following >= OUTCOME_OFFSET:
+        return state, following - OUTCOME_OFFSET
+    if following == _TAU_2:
+        rallies.caught[b] = True
+    elif following == _TAU_3:
+        rallies.over[b] = True
+        dx, dy = pos[0] - rallies.condition[b, 8], pos[1] - rallies.condition[b, 9]
+        rallies.landing_error[b] = np.sqrt(dx * dx + dy * dy)
+        if rallies.rounds_left[b] <= 1:
+            return following, _RETURNED
+    return following, 0
+
+
+@kernel
+def film(rallies: Rallies, b: int, pos: Vec, vel: Vec, state: int) -> None:
+    """Let a grid step pass: put the camera's true sample into the ring."""
+    rallies.clock[b] += 1
+    head = (rallies.head[b] + 1) % RING
+    rallies.head[b] = head
+    sample = rallies.camera[b, head]
+    for k in range(3):
+        sample[k], sample[3 + k] = pos[k], vel[k]
+    sample[6] = float(state // 2)
+
+
+@kernel
+def copy_path(motion: Motion, b: int, path: Array) -> None:
+    """Write robot b's joint positions at the control step's beginning and after each substep into ``path``."""
     for j in range(7):
         path[0, j] = motion.start_pos[b, j]
-        for k in range(substeps):
+        for k in range(motion.joint_pos.shape[1]):
             path[k + 1, j] = motion.joint_pos[b, k, j]
+
+
+@kernel
+def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array, step: Step) -> Flown:
+    """Fly ball b through one control step, with every touch in between."""
     fastest = speed_bound(path, motion.step)
     ball, condition = rallies.ball[b], rallies.condition[b]
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
-    target = (condition[8], condition[9], BALL_RADIUS)
     state = rallies.state[b]
     outcome = 0
-    paid_1, paid_2, paid_3 = False, False, False
+    bounced, hit, landed = False, False, False
     racket_speed = 0.0
     for k in range(6):
         step.impulse[b, k] = 0.0
@@ -224,7 +270,6 @@ def _play_one(
                 rallies.over[b] = True
             if what == NONE:
                 break
-            following = rules.transitions[state, what]
             if what in (ROBOT_COURT, OPPONENT_COURT):
                 vel, spin = table_bounce(vel, spin, normal, condition[2], condition[3])
             elif what == RACKET:
@@ -254,34 +299,40 @@ def _play_one(
                     step.impulse[b, k] += impulse[k]
                     step.impulse[b, 3 + k] += turn[k]
                 racket_speed = min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED)
-            if following >= OUTCOME_OFFSET:
-                outcome = following - OUTCOME_OFFSET
+            state, outcome = judge(rallies, b, state, what, pos, rules)
+            bounced, hit, landed = (
+                bounced or state == _TAU_1,
+                hit or state == _TAU_2,
+                landed or state == _TAU_3,
+            )
+            if outcome != 0:
                 break
-            state = following
-            if state == _TAU_1:
-                paid_1 = True
-            elif state == _TAU_2:
-                paid_2 = True
-                rallies.caught[b] = True
-            elif state == _TAU_3:
-                paid_3 = True
-                rallies.over[b] = True
-                dx, dy = pos[0] - target[0], pos[1] - target[1]
-                rallies.landing_error[b] = np.sqrt(dx * dx + dy * dy)
-                if rallies.rounds_left[b] <= 1:
-                    outcome = _RETURNED
-                    break
-        rallies.clock[b] += 1
-        head = (rallies.head[b] + 1) % RING
-        rallies.head[b] = head
-        sample = rallies.camera[b, head]
-        for k in range(3):
-            sample[k], sample[3 + k] = pos[k], vel[k]
-        sample[6] = float(state // 2)
+        film(rallies, b, pos, vel, state)
         if outcome != 0:
             break
+    return Flown(pos, vel, spin, state, outcome, bounced, hit, landed, racket_speed)
 
-    # Reward: rows of the instants met in this step, or else the continuing state's row once.
+
+@kernel
+def settle(
+    rallies: Rallies,
+    b: int,
+    flown: Flown,
+    motion: Motion,
+    actions: Array,
+    rules: Rules,
+    noise: NoiseProfile,
+    path: Array,
+    step: Step,
+) -> None:
+    """Pay for ball b's control step, write where it came to, and let the robot look.
+
+    Instants met in this step are paid their rows, all of them; without any, the continuing state's row is paid.
+    """
+    substeps = motion.joint_pos.shape[1]
+    ball, condition = rallies.ball[b], rallies.condition[b]
+    pos, vel, spin, state, outcome, bounced, hit, landed, racket_speed = flown
+    target = (condition[8], condition[9], BALL_RADIUS)
     joints = joints_at(path, substeps * motion.step, motion.step)
     reach = norm(sub(pos, racket_pose(joints).centre))
     near = norm(sub(pos, target))
@@ -290,14 +341,14 @@ def _play_one(
     rows, terms = rules.rewards, step.terms[b]
     for k in range(8):
         terms[k] = 0.0
-    if paid_1:
+    if bounced:
         terms[1] = rows[_TAU_1, 0]
-    if paid_2:
+    if hit:
         terms[2] = rows[_TAU_2, 0] + rows[_TAU_2, 2] * racket_speed
-    if paid_3:
+    if landed:
         miss = rallies.landing_error[b] / rules.landing_scale
         terms[4] = rows[_TAU_3, 0] + rows[_TAU_3, 4] / ((1.0 + miss * miss) * (1.0 + miss * miss))
-    if not (paid_1 or paid_2 or paid_3 or state == _TAU_0):
+    if not (bounced or hit or landed or state == _TAU_0):
         terms[0] = rules.rate_scale * rows[state, 1] * g
         terms[3] = rules.rate_scale * rows[state, 3] * aim
     torque, jitter, collision = 0.0, 0.0, 0.0
@@ -321,7 +372,7 @@ def _play_one(
     if state % 2 == 0:  # an instant lasts for one control step
         state += 1
     if outcome == 0 and (rallies.clock[b] * GRID_STEP >= rules.time_limit - 1e-9 or not norm(pos) < FARTHEST):
-        outcome = _TIME_OUT
+        outcome = _RETURNED if state == _TAU_30 else _TIME_OUT  # landed legally: nothing was cut
     step.outcome[b] = outcome
     rallies.state[b] = state
     for k in range(3):
@@ -336,7 +387,9 @@ def play_step(
     """Play every rally for one control step; ``rallies`` and ``step`` are written in place."""
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
-        _play_one(rallies, b, motion, actions, rules, noise, path, step)
+        copy_path(motion, b, path)
+        flown = _fly_one(rallies, b, motion, rules, path, step)
+        settle(rallies, b, flown, motion, actions, rules, noise, path, step)
 
 
 @kernel

@@ -10,6 +10,7 @@ import pytest
 
 from common.comms.transport import TransportError
 from common.config import ConfigError, HelpRequest
+from common.errors import ReportedError
 from common.log import set_up_logging
 from common.process import run_service
 

@@ -156,6 +156,17 @@ def test_a_rally_with_rounds_left_goes_on_over_its_landing_until_the_next_touch(
     assert seen[-1][1] == Outcome.RETURNED
 
 
+def test_a_landed_ball_is_returned_even_if_time_runs_out_before_its_next_touch():
+    rallies, step = begin(make_record((0.7, 0, 0.1), (0, 0, 0)), State.TAU_23)
+    rallies.rounds_left[0] = 2
+    rules = make_rules(time_limit=0.2)
+    for _ in range(10):
+        play.play_step(rallies, make_motion(AWAY, AWAY), np.zeros((1, 7)), rules, PROFILES["off"], step)
+
+    assert rallies.state[0] == State.TAU_30
+    assert step.outcome[0] == Outcome.RETURNED
+
+
 def test_a_graze_without_approach_is_no_contact():
     """A racket that leaves faster than the ball follows isn't hit, even from gap zero."""
     played = play_ball(
