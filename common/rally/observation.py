@@ -1,5 +1,9 @@
-"""What the policy sees and does: the 37 numbers and the 7, by name, unit and range."""
+"""What the policy sees and does: the 37 numbers and the 7, by name, unit and range.
 
+``python -m common.rally.observation`` prints the tables as Markdown: docs/observation.md is that text.
+"""
+
+import sys
 from typing import NamedTuple
 
 from common.rally.trajectory import State
@@ -54,3 +58,32 @@ ACTION_SIZE = size(ACTION)
 
 CONTINUING = (State.TAU_01, State.TAU_12, State.TAU_23, State.TAU_30)
 """The one-hot's order; an instant state shows as the one it continues as."""
+
+
+def markdown() -> str:
+    """Return both layouts as the text of docs/observation.md."""
+    lines = [
+        "# Observation and action",
+        "",
+        "World frame: origin at the centre of the table top, x from the robot to the opponent, y to the robot's left, z up.",
+        "Generated: `python -m common.rally.observation > docs/observation.md`.",
+    ]
+    for title, layout in (("Observation", OBSERVATION), ("Action", ACTION)):
+        lines += [
+            "",
+            f"## {title}: {size(layout)} numbers",
+            "",
+            "| index | name | unit | range | is |",
+            "|---|---|---|---|---|",
+        ]
+        for name, where in offsets(layout).items():
+            part = next(part for part in layout if part.name == name)
+            index = f"{where.start}-{where.stop - 1}" if part.size > 1 else str(where.start)
+            lines.append(
+                f"| {index} | {name} | {part.unit} | {part.low:g} to {part.high:g} | {part.meaning} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write(markdown())

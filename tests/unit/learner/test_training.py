@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from rollouts import make_rollout
 
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
@@ -12,6 +11,7 @@ from services.learner.checkpoint import CheckpointError, Extras, checkpoints, re
 from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
 from services.learner.training import Training, play_stats
+from tests.unit.learner.rollouts import make_rollout
 
 PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_epochs=1)
 CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=50)

@@ -1,12 +1,14 @@
 """The layouts of the 37 and the 7, and what stands in them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from common.physics.arm import racket_motion, racket_pose
 from common.rally import play
 from common.rally.noise import PROFILES
-from common.rally.observation import ACTION, OBSERVATION, offsets, size
+from common.rally.observation import ACTION, OBSERVATION, markdown, offsets, size
 from common.rally.trajectory import State
 from tests.unit.rally.scripted import HOME, begin, make_motion, make_record, make_rules
 
@@ -101,3 +103,7 @@ def test_near_home_the_quaternion_moves_without_jumps_of_sign():
 
     assert quaternions[:, 0].min() > 0.7
     np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0, atol=1e-6)
+
+
+def test_the_documented_layout_is_the_real_one():
+    assert (Path(__file__).parents[3] / "docs" / "observation.md").read_text() == markdown()
