@@ -65,7 +65,8 @@ def markdown() -> str:
     lines = [
         "# Observation and action",
         "",
-        "World frame: origin at the centre of the table top, x from the robot to the opponent, y to the robot's left, z up.",
+        "World frame: origin at the centre of the table top, x from the robot to the opponent, y to the robot's left,",
+        "z up.",
         "Generated: `python -m common.rally.observation > docs/observation.md`.",
     ]
     for title, layout in (("Observation", OBSERVATION), ("Action", ACTION)):
