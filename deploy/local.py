@@ -1,12 +1,15 @@
 """`python -m deploy.local`: a whole run on this machine; spawns every process and watches them."""
 
+import csv
 import json
 import logging
 import os
 import socket
-import subprocess
 import sys
 import time
+import tomllib
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
 from datetime import datetime
 from pathlib import Path
 from threading import Event
@@ -19,51 +22,71 @@ from rich.live import Live
 from common.comms.codec import DecodeError, decode
 from common.comms.keys import Keys
 from common.comms.messages import Status
-from common.comms.transport import Transport
+from common.comms.transport import Transport, TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.config import ConfigError, load
+from common.errors import ReportedError
 from common.log import set_up_logging
-from common.process import DONE, FAILED, run_service
-from common.run_folder import RunFolder
+from common.policy.weights import load_policy
+from common.process import DONE, INTERRUPTED, run_service
+from common.run_folder import LATEST, RUNS, RunFolder
 from deploy.config import DeployConfig, service_sections
-from deploy.panel import View, clock, render, time_left_s
+from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
 
 log = logging.getLogger(__name__)
 
 PROG = "python -m deploy.local"
 WATCH_S = 0.25
+CONNECT_S = 60.0  # for the learner to listen
 LINE_INTERVAL_S = 15.0  # between progress lines when there is no terminal
 LEARNER_PATIENCE_S = 30.0  # it writes a checkpoint
-WORKER_PATIENCE_S = 8.0
-ROLES = ("generator", "learner", "actor", "evaluator")
+WORKER_PATIENCE_S = 12.0  # an actor finishes its rollout and waits for the last verdicts
+LEARNER = "learner-0"
+LOG_FILE = "deploy.log"
+
+
+class RunFailedError(ReportedError):
+    """A process that the run can't do without has failed: one line with the last of its log."""
+
+
+class _Ended(Event):
+    """Set when a stop is asked for, or when a run is over before it began."""
+
+    def __init__(self, stop: Event, family: Family) -> None:
+        super().__init__()
+        self._asked, self._family = stop, family
+
+    def is_set(self) -> bool:
+        return self._asked.is_set() or self._family.status_of(LEARNER) is not None
 
 
 def specs(config: DeployConfig, config_file: Path) -> list[Spec]:
     """Return the processes of a run: the topology, as one function."""
 
     def service(role: str, index: int, *more: str) -> Spec:
-        port = config.metrics_port + ports[role] + index if config.metrics_port else 0
-        arguments = (
-            f"services.{role}",
-            "--config",
-            str(config_file),
-            "--id",
-            str(index),
-            "--metrics-port",
-            str(port),
-        )
+        arguments = ("--config", str(config_file), "--id", str(index), "--metrics-port", str(next(ports)))
         # The learner holds the run's state: its death ends the run, with its exit status, and --resume goes on.
-        return Spec(f"{role}-{index}", role, (*arguments, *more), restart=role != "learner")
+        return Spec(
+            f"{role}-{index}", role, (f"services.{role}", *arguments, *more), restart=role != "learner"
+        )
 
-    ports = {"learner": 0, "evaluator": 1, "generator": 2, "actor": 2 + config.generators}
-    family = [service("learner", 0, *(("--resume", "true") if config.resume else ()))]
-    family += [service("generator", i, "--index", str(i)) for i in range(config.generators)]
-    family += [service("actor", i, "--index", str(i)) for i in range(config.actors)]
+    ports = iter(metrics_ports(config))
+    # A run that was stopped before its first checkpoint begins anew.
+    resumes = config.resume and any((config_file.parent / "checkpoints").iterdir())
+    family = [service("learner", 0, *(("--resume",) if resumes else ()))]
     if config.evaluate:
         family.append(service("evaluator", 0))
+    family += [service("generator", i, "--index", str(i)) for i in range(config.generators)]
+    family += [service("actor", i, "--index", str(i)) for i in range(config.actors)]
     return family
+
+
+def metrics_ports(config: DeployConfig) -> list[int]:
+    """Return the port of each process's /metrics: learner, evaluator, generators, actors; 0 is any free one."""
+    count = 1 + config.evaluate + config.generators + config.actors
+    return [config.metrics_port + i if config.metrics_port else 0 for i in range(count)]
 
 
 def free_endpoint() -> str:
@@ -73,61 +96,118 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def settings(argv: Sequence[str]) -> DeployConfig:
+    """Return the settings of a run; a resumed one has those of its config.toml, but for the flags given now."""
+    config = load(DeployConfig, argv, prog=PROG, section="local")
+    if not config.resume:
+        if config.run == LATEST:
+            raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
+        return config
+    if not config.run:
+        newest = f": the newest run is {os.readlink(RUNS / LATEST)}" if (RUNS / LATEST).is_symlink() else ""
+        raise ConfigError(f"--resume needs --run NAME{newest}")
+    name = os.readlink(RUNS / LATEST) if config.run == LATEST else config.run
+    file = RunFolder.of(name).config
+    if not file.exists():
+        raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
+    if not any(word.split("=")[0] == "--config" for word in argv):
+        config = load(DeployConfig, [*argv, "--config", str(file)], prog=PROG, section="local")
+    return config.model_copy(update={"run": name})
+
+
 def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
     """Return name, folder and configuration file of a run, all of it written."""
     run = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
+    Keys(run)  # refuses a name that can't stand in a key, and so none that can't be a folder's
     folder = RunFolder.of(run)
     if folder.config.exists() and not config.resume:
         raise ConfigError(
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
-    if config.resume and not folder.config.exists():
-        raise ConfigError(f"run {run!r} can't be resumed: there is no {folder.config}")
+    check_ports(config)
     folder.create()
-    endpoint = config.endpoint or free_endpoint()
-    sections: dict[str, Any] = service_sections(config, run, endpoint, str(folder.root))
-    shared = config.model_dump(mode="json", exclude=set(ROLES))
-    folder.config.write_text(tomli_w.dumps({"local": shared | {"run": run}} | sections))
+    # A new endpoint each time unless one was asked for: the old one may be taken.
+    sections: dict[str, Any] = service_sections(
+        config, run, config.endpoint or free_endpoint(), str(folder.root)
+    )
+    local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
+    folder.config.write_text(tomli_w.dumps({"local": local} | sections))
     folder.point_latest_here()
     return run, folder, folder.config
 
 
-def final_line(run: str, folder: RunFolder, config: DeployConfig, learner: Status | None) -> dict[str, Any]:
-    """Return the run's last line: where it stands, and the measures of its final policy."""
-    gauges = learner.gauges if learner else {}
+def check_ports(config: DeployConfig) -> None:
+    """Raise ConfigError naming the first port of /metrics that is taken: a service would die of it again and again."""
+    for port in filter(None, metrics_ports(config)):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                raise ConfigError(
+                    f"port {port} can't be had: {error.strerror}; --metrics-port {config.metrics_port} needs "
+                    f"{len(metrics_ports(config))} free ports from there on"
+                ) from None
+
+
+def outcome(run: str, folder: RunFolder, learner: Status | None) -> dict[str, Any]:
+    """Return where a run stands, from what it wrote; the account of its rollouts is the learner's last word."""
+    contract = load_policy(folder.latest_policy).contract
     counters = learner.counters if learner else {}
-    result: dict[str, Any] = {
+    return {
         "run": run,
         "policy": str(folder.latest_policy),
-        "frames": int(counters.get("frames", 0)),
-        "stage": int(gauges.get("stage", 0)),
-        "seconds": round(gauges.get("seconds", 0.0), 1),
+        "frames": contract.frames,
+        "stage": contract.stage,
+        "seconds": trained_seconds(folder),
         "ledger": {
             name: int(counters.get(name, 0))
             for name in ("published", "trained", "refused", "dropped", "in_flight", "lost")
         },
     }
-    if config.evaluate:
-        command = [sys.executable, "-m", "services.evaluator", "--config", str(folder.config)]
-        command += [
-            "--policy",
-            str(folder.latest_policy),
-            "--rallies",
-            str(config.final_rallies),
-            "--json",
-            "true",
-        ]
-        command += ["--launch", "paper", "--noise", "standard"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise RuntimeError(
-                f"the final evaluation failed: {(done.stderr or done.stdout).strip().splitlines()[-1:]}"
-            )
-        measured = json.loads(done.stdout.strip().splitlines()[-1])
-        measured.pop("policy", None)
-        measured["evaluation_seconds"] = measured.pop("seconds")
-        result |= measured
-    return result
+
+
+def trained_seconds(folder: RunFolder) -> float:
+    """Return the time from the first trained batch to the last, through restarts [s]."""
+    if not folder.metrics.exists():
+        return 0.0
+    with folder.metrics.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return round(float(rows[-1]["seconds"]), 1) if rows else 0.0
+
+
+def final_measures(folder: RunFolder, config: DeployConfig, stop: Event) -> dict[str, Any]:
+    """Return the measures of the final policy, played in a process of their own; {} if asked to stop meanwhile."""
+    rallies, policy = str(config.final_rallies), str(folder.latest_policy)
+    arguments = (
+        "services.evaluator",
+        "--config",
+        str(folder.config),
+        "--policy",
+        policy,
+        "--rallies",
+        rallies,
+    )
+    spec = Spec(
+        "evaluation", "evaluator", (*arguments, "--json", "--launch", "paper", "--noise", "standard"), False
+    )
+    log.info("measuring the final policy rallies=%s", rallies)
+    family = Family([spec], folder.logs)
+    try:
+        while (status := family.status_of(spec.name)) is None and not stop.is_set():
+            time.sleep(0.05)
+    finally:
+        family.stop([spec.name], 0.0)
+    if stop.is_set():
+        return {}
+    if status != DONE:
+        raise RunFailedError(
+            f"the final evaluation ended with status {status}: {family.last_line(spec.name)}"
+        )
+    measured: dict[str, Any] = json.loads(family.last_line(spec.name))
+    measured.pop("policy")
+    measured["evaluation_seconds"] = measured.pop("seconds")
+    return measured
 
 
 class Watcher:
@@ -136,18 +216,15 @@ class Watcher:
     Args:
         view: What is shown.
         transport: Connection to the hub.
-        family: The processes.
     """
 
-    def __init__(self, view: View, transport: Transport, family: Family) -> None:
-        self._view, self._transport, self._family = view, transport, family
+    def __init__(self, view: View, transport: Transport) -> None:
+        self._view = view
         self._statuses = transport.subscribe(Keys(view.run).every_status(), capacity=4096)
         self._next_line = 0.0
 
     def look(self, now: float) -> None:
         """Take in what has arrived."""
-        self._family.watch(now)
-        self._view.restarts = {name: child.restarts for name, child in self._family.children.items()}
         for sample in self._statuses.poll():
             try:
                 self._view.hear(decode(sample.payload, Status), now)
@@ -163,7 +240,7 @@ class Watcher:
         g, c = learner.gauges, learner.counters
         measured = self._view.statuses.get(("evaluator", "0"))
         evaluated = measured.gauges if measured else {}
-        alive = sum(now - heard < 5.0 for heard in self._view.heard.values())
+        alive = sum(now - heard < STALE_S for heard in self._view.heard.values())
         log.info(
             "progress stage=%d frames=%d frames_per_s=%.0f catch=%.3f return=%.3f error=%.2f reward=%.1f lag=%.2f "
             "evaluation_catch=%.3f evaluation_return=%.3f alive=%d left=%s",
@@ -182,58 +259,96 @@ class Watcher:
         )
 
 
+def watch(
+    config: DeployConfig, view: View, transport: Transport, watcher: Watcher, family: Family, stop: Event
+) -> None:
+    """Keep the processes and show how they do, until the learner ends or ``stop`` is set."""
+    console = Console(stderr=True)
+    has_panel = config.panel == "on" or (config.panel == "auto" and console.is_terminal)
+    log_file = RunFolder.of(view.run).logs / LOG_FILE
+    with Live(console=console, auto_refresh=False) if has_panel else nullcontext() as live:
+        set_up_logging(
+            "info", "deploy", log_file
+        )  # to the stderr of now, which a panel has put its own hand on
+        while not stop.is_set() and family.status_of(LEARNER) is None:
+            now = time.monotonic()
+            family.watch(now)
+            watcher.look(now)
+            view.restarts = {name: child.restarts for name, child in family.children.items()}
+            if name := family.hopeless():
+                raise RunFailedError(f"{name} can't use its settings: {family.last_line(name)}")
+            if live is not None:
+                live.update(render(view, now), refresh=True)
+            else:
+                watcher.line(now)
+            transport.wait(WATCH_S)
+            stop.wait(0.05)  # heartbeats of many services must not keep us busy
+    set_up_logging("info", "deploy", log_file)
+
+
+def end(family: Family, stop: Event) -> None:
+    """End all processes; a run that was interrupted lets its actors meet a learner with what they have under way."""
+    workers = [name for name in family.children if name != LEARNER]
+    if stop.is_set():
+        family.stop(workers, WORKER_PATIENCE_S)
+    family.stop([LEARNER], LEARNER_PATIENCE_S)
+    family.stop(workers, WORKER_PATIENCE_S)
+
+
 def run(config: DeployConfig, stop: Event) -> int:
     """Run it all; return the exit status: 0 only if the learner did its work."""
     name, folder, config_file = prepare(config)
+    set_up_logging("info", "deploy", folder.logs / LOG_FILE)
     endpoint = load_endpoint(config_file)
     log.info("run=%s folder=%s endpoint=%s actors=%d", name, folder.root, endpoint, config.actors)
-    family = Family(specs(config, config_file), folder.logs)
     view = View(name, minutes=config.minutes, frames=config.frames)
-    console = Console(stderr=True)
-    has_panel = config.panel == "on" or (config.panel == "auto" and console.is_terminal)
-    transport: Transport | None = None
+    family = Family(specs(config, config_file), folder.logs)
     try:
-        transport = open_zenoh(ZenohConfig(endpoint=endpoint, connect_timeout_s=60.0), stop)
-        watcher = Watcher(view, transport, family)
-        with Live(console=console, auto_refresh=False, transient=False, redirect_stderr=has_panel) as live:
-            while not stop.is_set() and family.status_of("learner-0") is None:
-                now = time.monotonic()
-                watcher.look(now)
-                if has_panel:
-                    live.update(render(view, now), refresh=True)
-                else:
-                    watcher.line(now)
-                transport.wait(WATCH_S)
-                time.sleep(0.05)
-            watcher.look(time.monotonic())
-    finally:
-        workers = [n for n in family.children if n != "learner-0"]
-        if stop.is_set():  # actors first, so that what they have under way still meets a learner
-            family.stop(workers, WORKER_PATIENCE_S)
-        family.stop(["learner-0"], LEARNER_PATIENCE_S)
-        family.stop(workers, WORKER_PATIENCE_S)
+        transport = connect(endpoint, stop, family)
         if transport is not None:
-            transport.close()
-    status = family.status_of("learner-0")
-    if status != 0:
-        tail = (folder.logs / "learner-0.log").read_text(errors="replace").strip().splitlines()[-1:]
-        log.error("the learner ended with status %s: %s", status, " ".join(tail))
-        return FAILED
-    sys.stdout.write(json.dumps(final_line(name, folder, config, view.statuses.get(("learner", "0")))) + "\n")
+            with closing(transport):
+                watcher = Watcher(view, transport)
+                watch(config, view, transport, watcher, family, stop)
+                end(family, stop)
+                watcher.look(time.monotonic())  # the learner's last word
+    finally:
+        end(family, stop)
+    status = family.status_of(LEARNER)
+    if stop.is_set() and not folder.latest_policy.exists():
+        log.warning("stopped before anything was learned; begin with: %s --run %s --resume", PROG, name)
+        return INTERRUPTED
+    if status != DONE:
+        raise RunFailedError(f"the learner ended with status {status}: {family.last_line(LEARNER)}")
+    line = outcome(name, folder, view.statuses.get(("learner", "0")))
+    if config.evaluate and not stop.is_set():
+        line |= final_measures(folder, config, stop)
+    sys.stdout.write(json.dumps(line) + "\n")
+    if stop.is_set():
+        log.warning("stopped before its end; go on with: %s --run %s --resume", PROG, name)
+        return INTERRUPTED
     return DONE
+
+
+def connect(endpoint: str, stop: Event, family: Family) -> Transport | None:
+    """Return a connection to the learner, or None if it ended, or a stop was asked for, before it listened."""
+    ended = _Ended(stop, family)
+    try:
+        return open_zenoh(ZenohConfig(endpoint=endpoint, connect_timeout_s=CONNECT_S), ended)
+    except TransportError:
+        if ended.is_set():
+            return None
+        raise
 
 
 def load_endpoint(config_file: Path) -> str:
     """Return the endpoint that the run's configuration names."""
-    import tomllib  # noqa: PLC0415
-
     found: str = tomllib.loads(config_file.read_text())["learner"]["endpoint"]
     return found
 
 
 def main(stop: Event) -> int:
     """Run from the command line; return the exit status."""
-    config = load(DeployConfig, sys.argv[1:], prog=PROG, section="local")
+    config = settings(sys.argv[1:])
     set_up_logging("info", "deploy")
     return run(config, stop)
 

@@ -131,8 +131,8 @@ def render(view: View, now: float) -> RenderableType:
         silence = now - view.heard[role, id_]
         style = "red" if silence > STALE_S else ""
         who.add_row(
-            name,
-            status.state,
+            Text(name),  # as it is: names and states come from others, and brackets are markup
+            Text(status.state),
             _doing(status),
             f"{silence:.0f} s ago",
             str(view.restarts.get(name, 0)),

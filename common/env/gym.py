@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv
 from common.physics.flight import FULL, SIMPLE
-from common.rally.observation import ACTION, OBSERVATION, Part
+from common.rally.observation import ACTION, PAPER_OBSERVATION, Part, critic_layout
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -37,7 +37,6 @@ def _box(layout: tuple[Part, ...]) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-OBSERVATION_SPACE = _box(OBSERVATION)
 ACTION_SPACE = _box(ACTION)
 
 
@@ -46,7 +45,8 @@ class _Table:
 
     def __init__(self, count: int, stage: int, launch: str, settings: dict[str, Any]) -> None:
         self._count, self._stage, self._launch = count, stage, launch
-        self._config = EnvConfig(**settings)
+        self._config = EnvConfig(**({"observation": PAPER_OBSERVATION} | settings))
+        self.observation_space = _box(critic_layout(self._config.observation))
         self.env: RallyEnv | None = None
 
     def begin(self, seed: int) -> Floats:
@@ -64,9 +64,9 @@ class _Table:
         return self.env
 
 
-def _within(obs: Floats) -> Floats:
+def _within(obs: Floats, space: spaces.Box) -> Floats:
     """Return observations clipped to their stated ranges: a blow can throw a ball beyond them."""
-    clipped: Floats = np.clip(obs, OBSERVATION_SPACE.low, OBSERVATION_SPACE.high)
+    clipped: Floats = np.clip(obs, space.low, space.high)
     return clipped
 
 
@@ -99,9 +99,9 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
     def __init__(
         self, stage: int = 3, launch: str = "paper", render_mode: str | None = None, **settings: Any
     ) -> None:
-        self.observation_space, self.action_space = OBSERVATION_SPACE, ACTION_SPACE
         self.render_mode = render_mode
         self._table = _Table(1, stage, launch, settings)
+        self.observation_space, self.action_space = self._table.observation_space, ACTION_SPACE
         self._next_obs: Floats | None = None
 
     def reset(
@@ -116,7 +116,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         else:
             obs = self._next_obs
         self._next_obs = None
-        return _within(obs[0]), {}
+        return _within(obs[0], self._table.observation_space), {}
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Play one control step."""
@@ -127,7 +127,13 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         if step.ended.size:
             self._next_obs, obs = step.obs, step.final_obs
         info = {name: values[0] for name, values in _facts(step.finished).items() if values.size}
-        return _within(obs[0]), float(step.reward[0]), bool(step.terminated[0]), bool(step.truncated[0]), info
+        return (
+            _within(obs[0], self._table.observation_space),
+            float(step.reward[0]),
+            bool(step.terminated[0]),
+            bool(step.truncated[0]),
+            info,
+        )
 
 
 class RallyVectorEnv(VectorEnv[Any, Any, Any]):
@@ -156,11 +162,11 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         **settings: Any,
     ) -> None:
         self.num_envs = num_envs
-        self.single_observation_space, self.single_action_space = OBSERVATION_SPACE, ACTION_SPACE
-        self.observation_space = gymnasium.vector.utils.batch_space(OBSERVATION_SPACE, num_envs)
+        self._table = _Table(num_envs, stage, launch, settings)
+        self.single_observation_space, self.single_action_space = self._table.observation_space, ACTION_SPACE
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
         self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
         self.render_mode = render_mode
-        self._table = _Table(num_envs, stage, launch, settings)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -168,8 +174,8 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         """Begin all episodes anew; one seed decides them all."""
         super().reset(seed=seed)
         if seed is not None or self._table.env is None:
-            return _within(self._table.begin(_fresh_seed(self.np_random))), {}
-        return _within(self._table.env.reset()), {}
+            return _within(self._table.begin(_fresh_seed(self.np_random)), self._table.observation_space), {}
+        return _within(self._table.env.reset(), self._table.observation_space), {}
 
     def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """Play one control step with every robot."""
@@ -179,12 +185,20 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
             ended = np.zeros(self.num_envs, np.bool_)
             ended[step.ended] = True
             final_obs = np.full(self.num_envs, None, dtype=object)
-            for row, obs in zip(step.ended, _within(step.final_obs), strict=True):
+            for row, obs in zip(
+                step.ended, _within(step.final_obs, self._table.observation_space), strict=True
+            ):
                 final_obs[row] = obs
             infos = {"final_obs": final_obs, "_final_obs": ended, "_final_info": ended.copy()}
             infos["final_info"] = self._final_info(step.finished, ended)
         rewards = step.reward.astype(np.float64)
-        return _within(step.obs), rewards, step.terminated, step.truncated, infos
+        return (
+            _within(step.obs, self._table.observation_space),
+            rewards,
+            step.terminated,
+            step.truncated,
+            infos,
+        )
 
     def _final_info(self, finished: FinishedRallies, ended: Flags) -> dict[str, npt.NDArray[Any]]:
         """Return each fact as (B,), with its mask: Gymnasium's form of a batch of dicts."""

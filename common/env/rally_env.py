@@ -16,7 +16,7 @@ from common.physics.flight import FULL, SIMPLE
 from common.rally import play
 from common.rally.draws import Stream, between, uniform
 from common.rally.noise import PROFILES, Condition, NoiseProfile
-from common.rally.observation import ACTION_SIZE, OBSERVATION_SIZE
+from common.rally.observation import ACTION_SIZE, ObservationConfig, critic_layout, size
 from common.rally.reward import RewardConfig, reward_table
 from common.rally.trajectory import Outcome, transition_table
 
@@ -63,6 +63,7 @@ class EnvConfig(BaseModel):
         json_schema_extra={"unit": "m, rad"},
     )
     reward: RewardConfig = RewardConfig()
+    observation: ObservationConfig = ObservationConfig()
 
 
 class RallySource(Protocol):
@@ -101,12 +102,12 @@ class FinishedRallies:
 class EnvStep:
     """What one control step brought. Environments that ended are reset already."""
 
-    obs: Floats  # (B, 37) of the next step: after a reset the new episode's first
+    obs: Floats  # (B, D) observation.critic_layout of the next step: after a reset the new episode's first
     reward: Floats  # (B,)
     terminated: Flags  # (B,) the rally ended by its rules: the value of what follows is 0
     truncated: Flags  # (B,) the time limit cut it: bootstrap from final_obs
     ended: Rows  # (n,) rows with terminated or truncated
-    final_obs: Floats  # (n, 37) the last observation of each of ``ended``
+    final_obs: Floats  # (n, D) the last observation of each of ``ended``
     terms: Array  # (B, 8) reward.TERMS
     finished: FinishedRallies
 
@@ -159,12 +160,12 @@ class RallyEnv:
         self.noise = PROFILES[config.noise]
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
-        self._rallies, self._step = play.allocate(count)
+        self._rallies, self._step = play.allocate(count, config.observation.history)
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
         self._lengths = np.zeros(count, np.int32)
         self._all = np.arange(count)
-        self._obs = np.zeros((count, OBSERVATION_SIZE), np.float32)
+        self._obs = np.zeros((count, size(critic_layout(config.observation))), np.float32)
         self._rewards = reward_table(config.reward)
         self._started = False
         self.set_stage(stage)
@@ -200,13 +201,13 @@ class RallyEnv:
         return self._rallies
 
     def reset(self) -> Floats:
-        """Start every environment anew, robots at home; return the first observations (B, 37)."""
+        """Start every environment anew, robots at home; return the first observations (B, D)."""
         self._started = False
         self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
         self._rallies.last_action[:] = self.robot.home_action
         self._begin(self._all, np.zeros(self.count, np.bool_))
         self._started = True
-        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+        self._observe(self._all)
         return self._obs.copy()
 
     def step(self, actions: npt.ArrayLike) -> EnvStep:
@@ -225,7 +226,7 @@ class RallyEnv:
         self._validated[self.robot.faulty] = False
         self._returns += self._step.reward
         self._lengths += 1
-        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+        self._observe(self._all)
 
         outcome = self._step.outcome
         over = np.flatnonzero(outcome)
@@ -239,7 +240,7 @@ class RallyEnv:
         finished = self._finish(over)
         if over.size:
             self._begin(over, goes_on)
-            play.observe(self._rallies, over, self.robot.joint_pos, self.robot.joint_vel, self._obs)
+            self._observe(over)
         return EnvStep(
             obs=self._obs.copy(),
             reward=self._step.reward.astype(np.float32),
@@ -256,6 +257,14 @@ class RallyEnv:
         if self.config.collision == "original":
             return OriginalCollision(RobotAndBall(self.count, preset, rate, self._flight_model, threads))
         return TailoredCollision(RobotBatch(self.count, preset, rate, threads=threads))
+
+    def _observe(self, rows: Rows) -> None:
+        """Write the observations of ``rows``."""
+        options, robot = self.config.observation, self.robot
+        is_privileged = options.critic == "privileged"
+        play.observe(
+            self._rallies, rows, robot.joint_pos, robot.joint_vel, options.spin, is_privileged, self._obs
+        )
 
     def _finish(self, rows: Rows) -> FinishedRallies:
         r = self._rallies

@@ -25,7 +25,17 @@ from safetensors.numpy import save as save_tensors
 from common.errors import ReportedError
 from common.policy.actor_critic import ActorCritic, NetworkConfig
 from common.policy.normalizer import Moments, normalize
-from common.rally.observation import ACTION, ACTION_SIZE, OBSERVATION, OBSERVATION_SIZE, Part
+from common.rally.observation import (
+    ACTION,
+    ACTION_SIZE,
+    OBSERVATION,
+    PAPER_OBSERVATION,
+    ObservationConfig,
+    Part,
+    critic_layout,
+    policy_layout,
+    size,
+)
 
 WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
@@ -43,6 +53,7 @@ class Contract(BaseModel):
     format: int = 1
     observation: tuple[dict[str, Any], ...]
     action: tuple[dict[str, Any], ...]
+    observation_options: ObservationConfig = ObservationConfig()
     network: NetworkConfig
     control_rate_hz: float
     robot: str
@@ -61,13 +72,18 @@ def _described(layout: tuple[Part, ...]) -> tuple[dict[str, Any], ...]:
     return tuple(part._asdict() for part in layout)
 
 
-OBSERVATION_CONTRACT, ACTION_CONTRACT = _described(OBSERVATION), _described(ACTION)
+ACTION_CONTRACT = _described(ACTION)
+
+
+def observation_contract(config: ObservationConfig) -> tuple[dict[str, Any], ...]:
+    """Return what a policy with these options sees, for its contract."""
+    return _described(policy_layout(config))
 
 
 def task_hash(network: NetworkConfig, env: Mapping[str, Any], launch: str) -> str:
     """Return a hash of all that a learner and its actors must agree on: layouts, network, task and launches."""
     task = {
-        "observation": OBSERVATION_CONTRACT,
+        "observation": _described(OBSERVATION),
         "action": ACTION_CONTRACT,
         "network": network.model_dump(mode="json"),
         "env": dict(env),
@@ -112,12 +128,13 @@ def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) ->
     network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in tensors.items()})
 
 
-def observation_moments(mean: npt.NDArray[np.float64], var: npt.NDArray[np.float64], count: int) -> Moments:
-    """Return the moments that came with a policy; raises PolicyError if they are not an observation's."""
-    if not mean.shape == var.shape == (OBSERVATION_SIZE,):
-        raise PolicyError(
-            f"observation moments of shapes {mean.shape} and {var.shape}; allowed is ({OBSERVATION_SIZE},)"
-        )
+def observation_moments(
+    mean: npt.NDArray[np.float64], var: npt.NDArray[np.float64], count: int, config: ObservationConfig
+) -> Moments:
+    """Return the moments that came with a policy; raises PolicyError if they are not those of its observation."""
+    allowed = (size(critic_layout(config)),)
+    if not mean.shape == var.shape == allowed:
+        raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
     return Moments(mean, var, count)
 
 
@@ -130,9 +147,11 @@ class Policy:
     contract: Contract
 
     def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the deterministic actions (B, 7) for raw observations (B, 37)."""
+        """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is looked at."""
+        seen, moments = self.network.obs_size, self.moments
+        own = Moments(moments.mean[:seen], moments.var[:seen], moments.count)
         with torch.inference_mode():
-            mean, _ = self.network(torch.from_numpy(normalize(obs, self.moments)))
+            mean = self.network.act(torch.from_numpy(normalize(obs[:, :seen], own)))
         actions: npt.NDArray[np.float32] = mean.numpy()
         return actions
 
@@ -175,23 +194,31 @@ def load_policy(folder: Path) -> Policy:
         raise PolicyError(f"{folder / CONTRACT_FILE}: {where or 'file'}: {first['msg']}") from None
     except (SafetensorError, ValueError, KeyError) as error:
         raise PolicyError(f"{folder / WEIGHTS_FILE} is not readable as safetensors: {error}") from None
-    expected = json.loads(json.dumps([OBSERVATION_CONTRACT, ACTION_CONTRACT]))
+    options = contract.observation_options
+    expected = json.loads(json.dumps([observation_contract(options), ACTION_CONTRACT]))
     found = json.loads(json.dumps([contract.observation, contract.action]))
     if found != expected:
         raise PolicyError(
             f"{folder / CONTRACT_FILE}: its observation or action layout is not this version's "
-            f"({OBSERVATION_SIZE} and {ACTION_SIZE} numbers, see common/rally/observation.py)"
+            f"({size(policy_layout(options))} and {ACTION_SIZE} numbers, see common/rally/observation.py)"
         )
     for name in (_OBS_MEAN, _OBS_VAR, _OBS_COUNT):
         if name not in tensors:
             raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
-    moments = observation_moments(tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)))
-    network = new_network(contract.network)
+    moments = observation_moments(
+        tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)), options
+    )
+    network = new_network(contract.network, options)
     load_state(network, tensors)
     return Policy(network, moments, contract)
 
 
-def new_network(config: NetworkConfig, home_action: npt.NDArray[np.float32] | None = None) -> ActorCritic:
-    """Return a fresh network for this version's observation and action."""
+def new_network(
+    config: NetworkConfig,
+    observation: ObservationConfig = PAPER_OBSERVATION,
+    home_action: npt.NDArray[np.float32] | None = None,
+) -> ActorCritic:
+    """Return a fresh network for what policy and critic see."""
     home = np.zeros(ACTION_SIZE, np.float32) if home_action is None else home_action
-    return ActorCritic(OBSERVATION_SIZE, ACTION_SIZE, config, home)
+    own, all_ = size(policy_layout(observation)), size(critic_layout(observation))
+    return ActorCritic(own, ACTION_SIZE, config, home, all_ - own)

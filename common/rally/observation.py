@@ -4,7 +4,9 @@
 """
 
 import sys
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from common.rally.trajectory import State
 
@@ -34,6 +36,34 @@ OBSERVATION: tuple[Part, ...] = (
 )
 """The paper's observation, in its order (it prints "racket position (7)"; only 3 sums to 37)."""
 
+SPIN: tuple[Part, ...] = (
+    Part("ball_spin", 3, "rad/s", -1500.0, 1500.0, "the ball's true spin: no robot is told it"),
+)
+"""Option ``spin``: a ceiling to measure against."""
+
+EARLIER: tuple[Part, ...] = (
+    Part("earlier_ball_pos", 3, "m", -4.0, 4.0, "ball as perceived some control steps ago"),
+    Part("earlier_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity as perceived then"),
+)
+"""Option ``history``: one of these for each earlier control step, newest first. A memory shows drag and spin."""
+
+PRIVILEGED: tuple[Part, ...] = (
+    Part("true_ball_pos", 3, "m", -4.0, 4.0, "where the ball is, now"),
+    Part("true_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity"),
+    Part("true_ball_spin", 3, "rad/s", -1500.0, 1500.0, "its spin"),
+    Part("drag_lift", 2, "-", 0.0, 2.0, "factors of the air in this rally"),
+    Part("table", 2, "-", 0.0, 1.0, "restitution and friction of the table in this rally"),
+    Part(
+        "rubber",
+        4,
+        "-, s/m",
+        0.0,
+        1.0,
+        "restitution, its slope, alpha and spin loss of the racket in this rally",
+    ),
+)
+"""What the critic may see besides, in training: the simulator's truth. The policy never does."""
+
 ACTION: tuple[Part, ...] = (
     Part("joint_target", 7, "half-range", -1.0, 1.0, "each joint's absolute target: middle + a x half-range"),
 )
@@ -53,6 +83,40 @@ def offsets(layout: tuple[Part, ...]) -> dict[str, slice]:
     return found
 
 
+class ObservationConfig(BaseModel):
+    """What policy and critic see; the policy's default is the paper's 37 numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    history: int = Field(
+        0, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
+    )
+    spin: bool = Field(
+        False, description="tell the policy the ball's true spin: a ceiling, nothing for a robot"
+    )
+    critic: Literal["policy", "privileged"] = Field(
+        "privileged",
+        description="what the critic sees: what the policy does, or the simulator's truth besides",
+    )
+
+
+PAPER_OBSERVATION = ObservationConfig(critic="policy")
+"""The paper's: 37 numbers for policy and critic alike."""
+
+
+def policy_layout(config: ObservationConfig) -> tuple[Part, ...]:
+    """Return what the policy sees."""
+    earlier = tuple(
+        part._replace(name=f"{part.name}_{k}") for k in range(1, config.history + 1) for part in EARLIER
+    )
+    return OBSERVATION + (SPIN if config.spin else ()) + earlier
+
+
+def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
+    """Return what the critic sees: the policy's numbers first."""
+    return policy_layout(config) + (PRIVILEGED if config.critic == "privileged" else ())
+
+
 OBSERVATION_SIZE = size(OBSERVATION)
 ACTION_SIZE = size(ACTION)
 
@@ -69,7 +133,14 @@ def markdown() -> str:
         "z up.",
         "Generated: `python -m common.rally.observation > docs/observation.md`.",
     ]
-    for title, layout in (("Observation", OBSERVATION), ("Action", ACTION)):
+    tables = (
+        ("Observation", OBSERVATION),
+        ("Option spin, after it", SPIN),
+        ("Option history, after that, each", EARLIER),
+        ("What the critic alone sees, last", PRIVILEGED),
+        ("Action", ACTION),
+    )
+    for title, layout in tables:
         lines += [
             "",
             f"## {title}: {size(layout)} numbers",

@@ -59,6 +59,7 @@ class Rallies(NamedTuple):
     camera: Array  # (B, RING, 7) true samples on the grid, newest at ``head``
     head: Integers  # (B,)
     seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
+    earlier: Array  # (B, history, 6) what it went by one, two ... control steps ago
     last_action: Array  # (B, 7)
 
 
@@ -111,8 +112,8 @@ class Flown(NamedTuple):
     racket_speed: float  # [m/s] v of the reward, where hit
 
 
-def allocate(count: int) -> tuple[Rallies, Step]:
-    """Return zeroed rows for ``count`` rallies."""
+def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
+    """Return zeroed rows for ``count`` rallies that remember ``history`` earlier samples."""
     rallies = Rallies(
         ball=np.zeros((count, 9)),
         state=np.zeros(count, np.int64),
@@ -126,6 +127,7 @@ def allocate(count: int) -> tuple[Rallies, Step]:
         camera=np.zeros((count, RING, SAMPLE)),
         head=np.zeros(count, np.int64),
         seen=np.zeros((count, SAMPLE)),
+        earlier=np.zeros((count, history, 6)),
         last_action=np.zeros((count, 7)),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
@@ -138,6 +140,10 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     seed = rallies.seed[b]
     moment = rallies.clock[b] * GRID_STEP
     condition = rallies.condition[b]
+    earlier = rallies.earlier[b]
+    for k in range(earlier.shape[0] - 1, -1, -1):
+        for j in range(6):
+            earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
     in_burst = condition[12] <= moment < condition[13]
     if step > 0 and (in_burst or uniform(seed, _CAMERA, 8 * step) < noise.loss):
         return
@@ -186,6 +192,9 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
             rallies.camera[b, row, k] = record[k]
         rallies.camera[b, row, 6] = 0.0
     _look(rallies, b, 0, noise)
+    for k in range(rallies.earlier.shape[1]):
+        for j in range(6):
+            rallies.earlier[b, k, j] = rallies.seen[b, j]
 
 
 @kernel
@@ -403,15 +412,23 @@ def launch_rallies(
 
 @kernel
 def observe(
-    rallies: Rallies, rows: Integers, joint_pos: Array, joint_vel: Array, out: npt.NDArray[np.float32]
+    rallies: Rallies,
+    rows: Integers,
+    joint_pos: Array,
+    joint_vel: Array,
+    spin: bool,
+    privileged: bool,
+    out: npt.NDArray[np.float32],
 ) -> None:
-    """Write ``observation.OBSERVATION`` of ``rows`` (n,) into the same rows of ``out`` (B, 37).
+    """Write ``observation.critic_layout`` of ``rows`` (n,) into the same rows of ``out`` (B, D).
 
     Args:
         rallies: Rows to read.
         rows: Which.
         joint_pos: Joint positions now (B, 7).
         joint_vel: Joint velocities now (B, 7).
+        spin: Whether the policy is told the true spin.
+        privileged: Whether the critic's truth follows.
         out: Rows to write.
     """
     for k in range(rows.shape[0]):
@@ -435,3 +452,17 @@ def observe(
         o[32] = 2.0 * s / 3.0 - 1.0
         for j in range(4):
             o[33 + j] = 1.0 if j == s else 0.0
+        at = 37
+        if spin:
+            for j in range(3):
+                o[at + j] = rallies.ball[b, 6 + j]
+            at += 3
+        for earlier in range(rallies.earlier.shape[1]):
+            for j in range(6):
+                o[at + j] = rallies.earlier[b, earlier, j]
+            at += 6
+        if privileged:
+            for j in range(9):
+                o[at + j] = rallies.ball[b, j]
+            for j in range(8):  # drag, lift, table, rubber
+                o[at + 9 + j] = rallies.condition[b, j]

@@ -12,9 +12,9 @@ from common.comms.messages import UNVALIDATED, Episodes, PolicySnapshot, Rollout
 from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
-from common.policy.weights import PolicyError, new_network, task_hash, unpack
+from common.policy.weights import PolicyError, new_network, observation_moments, task_hash, unpack
 from common.rally.draws import Stream, bits
-from common.rally.observation import ACTION_SIZE, OBSERVATION_SIZE
+from common.rally.observation import ACTION_SIZE, critic_layout, size
 from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 
@@ -50,8 +50,9 @@ class Player:
         self.env = RallyEnv(envs, config, source)
         self.contract_hash = task_hash(network, config.model_dump(mode="json"), launch)
         self.snapshot: PolicySnapshot | None = None
-        self._network = new_network(network)
-        self._moments = Moments.initial(OBSERVATION_SIZE)
+        self._obs_size = size(critic_layout(config.observation))
+        self._network = new_network(network, config.observation)
+        self._moments = Moments.initial(self._obs_size)
         self._noise = torch.Generator()
         self._seed = seed
         self._clock = clock
@@ -65,8 +66,11 @@ class Player:
                 f"policy has contract {snapshot.contract_hash}, this actor has {self.contract_hash}: "
                 "start both with the same network, env and launch settings"
             )
+        moments = observation_moments(
+            snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, self.env.config.observation
+        )
         unpack(self._network, snapshot.weights)
-        self._moments = Moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count)
+        self._moments = moments
         if self.snapshot is None or self.snapshot.stage != snapshot.stage:
             self.env.set_stage(snapshot.stage)
         self.snapshot = snapshot
@@ -83,7 +87,7 @@ class Player:
         self._noise.manual_seed(int(bits(self._seed, Stream.RESET, sequence)) >> 1)
         if self._obs is None:
             self._obs = self.env.reset()
-        obs = np.empty((steps, envs, OBSERVATION_SIZE), np.float32)
+        obs = np.empty((steps, envs, self._obs_size), np.float32)
         actions = np.empty((steps, envs, ACTION_SIZE), np.float32)
         log_mu, values, rewards = (np.empty((steps, envs), np.float32) for _ in range(3))
         terminated, truncated = np.empty((steps, envs), np.bool_), np.empty((steps, envs), np.bool_)
@@ -136,7 +140,7 @@ class Player:
             rewards=rewards,
             terminated=terminated,
             truncated=truncated,
-            final_obs=np.concatenate(final_obs) if final_obs else np.zeros((0, OBSERVATION_SIZE), np.float32),
+            final_obs=np.concatenate(final_obs) if final_obs else np.zeros((0, self._obs_size), np.float32),
             final_index=np.concatenate(final_index) if final_index else np.zeros(0, np.int32),
             last_obs=self._obs.copy(),
             rally_flags=flags,

@@ -3,12 +3,31 @@
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from common.comms.messages import RallyBatch
 from common.env.rally_env import Launches
-from common.rally.launch import Purpose, draw_rallies
+from common.rally.launch import DRAG_FACTOR, LIFT_FACTOR, POSITION, SPIN, VELOCITY, Purpose, draw_rallies
+
+# Far beyond every preset: a ball from elsewhere than a generator must not blow the simulation up.
+LIMITS: Final = (
+    ("position", POSITION, -5.0, 5.0),  # m
+    ("velocity", VELOCITY, -60.0, 60.0),  # m/s
+    ("spin", SPIN, -3000.0, 3000.0),  # rad/s
+    ("drag and lift factor", slice(DRAG_FACTOR, LIFT_FACTOR + 1), 0.0, 5.0),
+)
+
+
+def launch_fault(batch: RallyBatch) -> str:
+    """Return what about a batch can't be a launch, or ""."""
+    for name, columns, low, high in LIMITS:
+        values = batch.rallies[:, columns]
+        wild = values[(values < low) | (values > high)]
+        if wild.size:
+            return f"{name} {wild[0]:g}; allowed: {low:g} to {high:g}"
+    return ""
 
 
 @dataclass(slots=True)
@@ -27,7 +46,8 @@ class RallyBuffer:
     """Rallies in the order they came; when empty, random launches, counted and flagged as unvalidated.
 
     Args:
-        capacity: Rallies held: as many as the actor has environments.
+        capacity: Rallies wanted in stock: as many as the actor has environments. The batch that fills the ring
+            is held whole, so that batches of any size lose nothing.
         preset: Launch preset of the fallback.
         noise: Noise profile of the fallback.
         seed: Of the fallback launches.
@@ -50,8 +70,8 @@ class RallyBuffer:
 
     @property
     def room(self) -> int:
-        """How many rallies fit in without pushing others out."""
-        return self._capacity - len(self._ring)
+        """How many rallies the stock lacks; while it lacks any, one more batch pushes nothing out."""
+        return max(0, self._capacity - len(self._ring))
 
     def put(self, batch: RallyBatch) -> None:
         """Take a batch in; a batch that came before is counted and left."""
@@ -65,14 +85,16 @@ class RallyBuffer:
         self._last[source] = batch.sequence
         self._ring.extend(zip(batch.rallies, batch.seeds, strict=True))
         self.counts.received += len(batch.seeds)
-        while len(self._ring) > self._capacity:
+        while len(self._ring) > self._capacity - 1 + len(batch.seeds):
             self._ring.popleft()
             self.counts.overflowed += 1
 
     def take(self, count: int) -> Launches:
         """Return ``count`` launches, oldest first; never blocks."""
-        if len(self._ring) < count:
+        while (before := len(self._ring)) < count:
             self._refill()
+            if len(self._ring) == before:
+                break
         stocked = [self._ring.popleft() for _ in range(min(count, len(self._ring)))]
         records = np.empty((count, 11))
         seeds = np.empty(count, np.uint64)

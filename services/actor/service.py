@@ -21,13 +21,14 @@ from common.comms.messages import (
     Verdict,
 )
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
+from common.errors import ReportedError
 from common.metrics import Metrics
 from common.policy.weights import PolicyError
 from common.rally.draws import Stream, bits
 from services.actor import outbox as box
 from services.actor.config import ActorConfig
 from services.actor.player import Player
-from services.actor.rally_buffer import RallyBuffer
+from services.actor.rally_buffer import RallyBuffer, launch_fault
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +36,18 @@ IDLE_WAIT_S = 0.05
 RALLY_BATCHES = 8  # that wait beside the ring until there is room for them
 REPORT_INTERVAL_S = 0.25  # without credits: no grant can be lost for longer
 ASK_AGAIN_S = 1.0  # for the policy
+ASK_RALLIES_S = 2.0  # for one block
+LAST_VERDICTS_S = 2.0  # at the end, for what is under way
+GOODBYE_S = 2.0
 LEARNER_ID = "0"
+
+
+class NoRalliesError(ReportedError):
+    """The generator that a reproducible run can't do without is missing."""
+
+
+class _AskedToStop(Exception):  # noqa: N818 - not an error
+    """A stop came while a rollout was played that can't be finished."""
 
 
 class ActorService:
@@ -63,13 +75,15 @@ class ActorService:
         self._report: PendingReply | None = None
         self._asked: PendingReply | None = None
         self._next_ask = self._next_report = self._next_status = 0.0
+        self._may_have_missed = False  # a policy, while the link was down or the mailbox full
         self._policies = transport.subscribe(keys.policy(), capacity=1)
         self._stages = transport.subscribe(keys.stage(), capacity=64)
         asks = config.rallies == "ask"
         self._rallies = None if asks else transport.subscribe(keys.rally(self._shard), capacity=RALLY_BATCHES)
-        self._batches: deque[RallyBatch] = deque(maxlen=RALLY_BATCHES)
-        self._born: float | None = None
+        self._batches: deque[RallyBatch] = deque()
+        self._ready: float | None = None  # since when there is a policy
         self._block = 0
+        self._stop = Event()
         self._control = transport.serve(keys.ctl("actor", config.id), capacity=16)
         self._alive = transport.declare_alive(keys.alive("actor", config.id, incarnation))
         self._reconnects = transport.reconnect_count
@@ -77,7 +91,6 @@ class ActorService:
         self._frames = 0
         self._idle_since: float | None = None
         self._warned = False
-        self._busy_s = {"play": 0.0, "send": 0.0}
         self.state = "waiting"
 
     @property
@@ -117,15 +130,23 @@ class ActorService:
 
     def run(self, stop: Event) -> None:
         """Work until ``stop`` is set or a drain is done, then say goodbye."""
-        while not stop.is_set() and not self.drained:
-            wait = self.step(time.monotonic())
-            if wait > 0:
-                self._transport.wait(wait)
+        self._stop = stop
+        try:
+            while not stop.is_set() and not self.drained:
+                wait = self.step(time.monotonic())
+                if wait > 0:
+                    self._transport.wait(wait)
+        except _AskedToStop:
+            log.info("stopped within a rollout, which nobody will see")
         self.leave()
 
     def leave(self) -> None:
-        """Tell the learner that nothing will follow, and what is still under way."""
-        pending = self._send_report(leaving=True, timeout_s=2.0)
+        """Wait a moment for the last verdicts, and tell the learner that nothing will follow."""
+        deadline = time.monotonic() + LAST_VERDICTS_S
+        while self._pending and time.monotonic() < deadline:
+            self._take_verdicts(time.monotonic())
+            self._transport.wait(IDLE_WAIT_S)
+        pending = self._send_report(leaving=True, timeout_s=GOODBYE_S)
         if pending.wait() is NoReply.TIMEOUT:
             log.warning("the learner did not answer the goodbye")
         self._publish_status()
@@ -134,7 +155,6 @@ class ActorService:
     # ---- what to do
 
     def _idle_reason(self, now: float) -> str:
-        self._born = now if self._born is None else self._born
         snapshot = self._player.snapshot
         if self._paused:
             return "a resume"
@@ -142,8 +162,12 @@ class ActorService:
             return "the last verdicts"
         if snapshot is None:
             return f"a policy from the learner on {self._keys.policy()}"
-        if self._frames == 0 and now - self._born < self._config.rally_wait_s and self._buffer.room > 0:
-            self._refill()  # begin with valid rallies in every environment
+        self._ready = now if self._ready is None else self._ready
+        is_patient = self._rallies is None or now - self._ready < self._config.rally_wait_s
+        if (
+            self._frames == 0 and is_patient and self._buffer.room > 0
+        ):  # begin with a full stock of valid rallies
+            self._refill()
             if self._buffer.room > 0:
                 return f"rallies of shard {self._shard} from a generator"
         return box.idle_reason(self._outbox, snapshot.generation, snapshot.version)
@@ -184,13 +208,14 @@ class ActorService:
                 self._refused("stage", error)
                 continue
             if self._player.snapshot is None or change.number > self._player.snapshot.stage_number:
-                self._next_ask = now  # the policy of the new stage may have been missed: ask
+                self._may_have_missed = True
         if self._transport.reconnect_count != self._reconnects:
             self._reconnects = self._transport.reconnect_count
-            self._next_ask = now
+            self._may_have_missed = True
         if self._asked is not None and (outcome := self._asked.poll()) is not None:
             self._asked = None
             if isinstance(outcome, Reply):
+                self._may_have_missed = False
                 self._adopt(outcome.payload)
         if self._asked is None and now >= self._next_ask and self._is_behind():
             self._next_ask = now + ASK_AGAIN_S
@@ -202,7 +227,7 @@ class ActorService:
         if snapshot is None:
             return True
         newest = (self._outbox.generation, self._outbox.credit_version)
-        return (snapshot.generation, snapshot.version) < newest or self._next_ask > 0
+        return (snapshot.generation, snapshot.version) < newest or self._may_have_missed
 
     def _adopt(self, payload: bytes) -> None:
         try:
@@ -214,6 +239,7 @@ class ActorService:
         except (DecodeError, PolicyError) as error:
             self._refused("policy", error)
             return
+        self._next_report = 0.0  # a new version wants new rollouts: ask for its credits at once
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.set("topspin_stage", snapshot.stage)
         if (
@@ -296,39 +322,52 @@ class ActorService:
         if self._rallies is None:
             self._ask_for_rallies()
             return
-        for sample in self._rallies.poll():
-            try:
-                batch = decode(sample.payload, RallyBatch)
-            except DecodeError as error:
-                self._refused("rally", error)
-                continue
-            if (batch.preset, batch.noise) != (self._config.launch, self._config.env.noise):
-                self._refused("rally", f"{batch.preset}/{batch.noise} from generator {batch.source}")
-                continue
-            self._batches.append(batch)
-        while self._batches and len(self._batches[0].seeds) <= max(self._buffer.room, 1):
+        while self._buffer.room > 0:
+            if not self._batches:  # what nobody needs yet stays in the mailbox, where the newest wins
+                self._batches.extend(filter(None, (self._batch(s.payload) for s in self._rallies.poll())))
+            if not self._batches:
+                return
             self._buffer.put(self._batches.popleft())
+
+    def _batch(self, payload: bytes) -> RallyBatch | None:
+        """Return the batch in a message, or None if it is of no use here."""
+        try:
+            batch = decode(payload, RallyBatch)
+        except DecodeError as error:
+            self._refused("rally", error)
+            return None
+        fault = launch_fault(batch)
+        if (batch.preset, batch.noise) != (self._config.launch, self._config.env.noise):
+            fault = f"{batch.preset}/{batch.noise}; allowed: {self._config.launch}/{self._config.env.noise}"
+        if fault:
+            self._refused("rally", f"generator={batch.source} {fault}")
+            return None
+        return batch
 
     def _ask_for_rallies(self) -> None:
         """Fetch the next block by index and wait for it: which rally is played when must not depend on timing."""
-        request = encode(RallyRequest(shard=self._shard, block=self._block))
+        key, request = (
+            self._keys.rally(self._shard),
+            encode(RallyRequest(shard=self._shard, block=self._block)),
+        )
         deadline = time.monotonic() + self._config.rally_wait_s
-        while time.monotonic() < deadline:
-            outcome = self._transport.request(self._keys.rally(self._shard), request, 2.0, Flow.RALLY).wait()
-            if isinstance(outcome, Reply):
-                try:
-                    batch = decode(outcome.payload, RallyBatch)
-                except DecodeError as error:
-                    self._refused("rally", error)
-                    continue
+        while not self._stop.is_set():
+            outcome = self._transport.request(key, request, ASK_RALLIES_S, Flow.RALLY).wait()
+            batch = self._batch(outcome.payload) if isinstance(outcome, Reply) else None
+            if batch is not None and batch.block == self._block:
                 # In this mode blocks are numbered by what was asked for, whoever answers.
                 self._buffer.put(replace(batch, source="asked", incarnation=0, sequence=self._block))
                 self._block += 1
                 return
-            time.sleep(0.05)
-        log.warning(
-            "waiting for=%r gave up after %.0f s", f"rally block {self._block}", self._config.rally_wait_s
-        )
+            if self._frames == 0 and not self._buffer.counts.consumed:
+                return  # nothing is played yet: `step` asks again
+            if time.monotonic() > deadline:
+                raise NoRalliesError(
+                    f"no rally block {self._block} of shard {self._shard} in {self._config.rally_wait_s:.0f} s, and "
+                    "a reproducible run can't go on without: start a generator (python -m services.generator)"
+                )
+            self._transport.wait(IDLE_WAIT_S)
+        raise _AskedToStop
 
     # ---- being a service
 
@@ -353,6 +392,10 @@ class ActorService:
         counts, rallies = self._outbox.counts, self._buffer.counts
         snapshot = self._player.snapshot
         m = self._metrics
+        m.follow("topspin_reconnects_total", self._transport.reconnect_count)
+        for name, mailbox in (("stage", self._stages), ("rally", self._rallies), ("control", self._control)):
+            if mailbox is not None:
+                m.follow("topspin_messages_dropped_total", mailbox.dropped, key=name)
         m.set("topspin_rollouts_in_flight", counts.in_flight)
         m.set("topspin_rally_buffer_depth", len(self._buffer))
         counters = {

@@ -55,6 +55,7 @@ def play_once(config: EvaluatorConfig) -> None:
             "rounds": config.rounds,
             "control_rate_hz": contract.control_rate_hz,
             "robot": contract.robot,
+            "observation": contract.observation_options,
         }
     )
     rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)

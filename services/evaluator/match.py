@@ -1,5 +1,6 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,22 @@ def evaluation_rallies(count: int, launch: str, noise: str, seed: int, flight: s
     return draw_rallies(count, seed=seed, preset=launch, noise=noise, purpose=Purpose.EVALUATION, model=model)
 
 
-def play_match(policy: Policy, rallies: RallyBlock, config: EnvConfig, envs: int = DEFAULT_ENVS) -> Played:
-    """Return what ``policy`` made of ``rallies``, without exploration noise, in the order they ended."""
+def play_match(
+    policy: Policy,
+    rallies: RallyBlock,
+    config: EnvConfig,
+    envs: int = DEFAULT_ENVS,
+    breathe: Callable[[], None] = lambda: None,
+) -> Played:
+    """Return what ``policy`` made of ``rallies``, without exploration noise, in the order they ended.
+
+    Args:
+        policy: Who plays.
+        rallies: What is played, each once.
+        config: The task.
+        envs: Environments played together.
+        breathe: Called between control steps, so that the caller can look after other things, or raise.
+    """
     envs = min(envs, len(rallies.seeds))
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
     env = RallyEnv(envs, config.model_copy(update={"go_on": 0.0}), FixedRallies(rallies, filler), stage=3)
@@ -56,6 +71,7 @@ def play_match(policy: Policy, rallies: RallyBlock, config: EnvConfig, envs: int
     ended: list[FinishedRallies] = []
     left = len(rallies.seeds)
     while left > 0:
+        breathe()
         step = env.step(policy.act(obs))
         obs = step.obs
         if step.finished.rows.size:

@@ -12,14 +12,15 @@ from common.comms.keys import Keys
 from common.comms.messages import Command, Control, ControlReply, PolicySnapshot, Status
 from common.comms.transport import Flow, Reply, Transport
 from common.metrics import Metrics
-from common.policy.normalizer import Moments
 from common.policy.weights import (
     ACTION_CONTRACT,
-    OBSERVATION_CONTRACT,
     Contract,
     Policy,
     PolicyError,
+    load_policy,
     new_network,
+    observation_contract,
+    observation_moments,
     save_policy,
     unpack,
 )
@@ -45,6 +46,10 @@ CURVE = (
     "target_error_median",
     "rallies",
 )
+
+
+class _AskedToStop(Exception):  # noqa: N818 - not an error
+    """A stop came within a match."""
 
 
 def score(stage: int, found: dict[str, Any]) -> tuple[int, float, float]:
@@ -74,7 +79,7 @@ class EvaluatorService:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
-        self._network = new_network(config.network)
+        self._network = new_network(config.network, config.env.observation)
         self._incarnation = incarnation
         self._keys = keys = Keys(config.run)
         self._policies = transport.subscribe(keys.policy(), capacity=1)
@@ -87,7 +92,8 @@ class EvaluatorService:
         )
         self._snapshot: PolicySnapshot | None = None
         self._played = (-1, -1)
-        self._best: tuple[int, float, float] | None = None
+        self._best = self._best_so_far()
+        self._stop = Event()
         self._born = clock()
         self._next_play = self._born
         self._next_status = 0.0
@@ -99,9 +105,13 @@ class EvaluatorService:
 
     def run(self, stop: Event) -> None:
         """Evaluate until ``stop`` is set or a stop is asked for."""
-        while not stop.is_set() and not self._stopping:
-            self.step()
-            self._transport.wait(IDLE_WAIT_S)
+        self._stop = stop
+        try:
+            while not stop.is_set() and not self._stopping:
+                self.step()
+                self._transport.wait(IDLE_WAIT_S)
+        except _AskedToStop:
+            log.info("stopped within a match, which counts for nothing")
         self._alive.close()
 
     def step(self) -> None:
@@ -123,9 +133,30 @@ class EvaluatorService:
             self._evaluate(snapshot)
             self._next_play = self._clock() + self._config.interval_s
             self.state = "waiting"
+        self._beat()
+
+    def _beat(self) -> None:
+        now = self._clock()
         if now >= self._next_status:
             self._next_status = now + self._config.status_interval_s
             self._publish_status()
+
+    def _breathe(self) -> None:
+        """Stay answerable within a match, which takes longer than anybody would wait."""
+        self._obey()
+        self._beat()
+        if self._stop.is_set() or self._stopping:
+            raise _AskedToStop
+
+    def _best_so_far(self) -> tuple[int, float, float] | None:
+        """Return the score of the best policy that an earlier life kept, if it was measured as we measure."""
+        try:
+            contract = load_policy(self._folder.best_policy).contract
+            if contract.measures["rallies"] != self._config.rallies:
+                return None
+            return score(contract.stage, dict(contract.measures))
+        except (PolicyError, KeyError):
+            return None
 
     def _obey(self) -> None:
         while (request := self._control.poll()) is not None:
@@ -140,9 +171,13 @@ class EvaluatorService:
 
     def _take(self, payload: bytes) -> None:
         try:
-            self._snapshot = decode(payload, PolicySnapshot)
+            snapshot = decode(payload, PolicySnapshot)
         except DecodeError as error:
             self._refused("policy", error)
+            return
+        mine = self._snapshot
+        if mine is None or (snapshot.generation, snapshot.version) > (mine.generation, mine.version):
+            self._snapshot = snapshot
 
     def _refused(self, kind: str, reason: object) -> None:
         self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
@@ -152,15 +187,20 @@ class EvaluatorService:
         started = self._clock()
         try:
             unpack(self._network, snapshot.weights)
+            moments = observation_moments(
+                snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, self._config.env.observation
+            )
         except PolicyError as error:
             self._refused("policy", error)
+            self._snapshot, self._played = (
+                None,
+                (-1, -1),
+            )  # however high its version: the next good one counts
             return
         contract = self._contract(snapshot)
-        policy = Policy(
-            self._network, Moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count), contract
-        )
+        policy = Policy(self._network, moments, contract)
         env = self._config.env.model_copy(update={"noise": self._config.noise, "rounds": self._config.rounds})
-        found = measures(play_match(policy, self._rallies, env, self._config.envs))
+        found = measures(play_match(policy, self._rallies, env, self._config.envs, self._breathe))
         self.evaluations += 1
         seconds = self._clock() - started
         log.info(
@@ -201,7 +241,8 @@ class EvaluatorService:
     def _contract(self, snapshot: PolicySnapshot) -> Contract:
         env = self._config.env
         return Contract(
-            observation=OBSERVATION_CONTRACT,
+            observation=observation_contract(env.observation),
+            observation_options=env.observation,
             action=ACTION_CONTRACT,
             network=self._config.network,
             control_rate_hz=env.control_rate_hz,
@@ -225,6 +266,9 @@ class EvaluatorService:
             writer.writerow(values)
 
     def _publish_status(self) -> None:
+        m = self._metrics
+        m.follow("topspin_reconnects_total", self._transport.reconnect_count)
+        m.follow("topspin_messages_dropped_total", self._control.dropped, key="control")
         status = Status(
             role="evaluator",
             id=self._config.id,

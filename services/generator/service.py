@@ -45,7 +45,7 @@ class GeneratorService:
         self._alive = transport.declare_alive(keys.alive("generator", config.id, incarnation))
         self._pace = {shard: Pace(config.rate_hz, config.batch) for shard in self._shards}
         self._sequence = dict.fromkeys(self._shards, 0)
-        self._paused = False
+        self._paused = self._stopping = False
         self._next_status = 0.0
         self._drawn = self._valid = self._published = 0
         self.state = "idle"
@@ -73,7 +73,7 @@ class GeneratorService:
         log.info(
             "generating launch=%s noise=%s shards=%s", self._config.launch, self._config.noise, self._shards
         )
-        while not stop.is_set():
+        while not stop.is_set() and not self._stopping:
             wait = self.step(time.monotonic())
             if wait > 0:
                 self._transport.wait(wait)
@@ -97,16 +97,9 @@ class GeneratorService:
             except DecodeError as error:
                 self._refuse(request, error)
                 continue
-            known = command in (Command.PAUSE, Command.RESUME)
-            if known:
-                self._paused = command is Command.PAUSE
-            request.reply(
-                encode(
-                    ControlReply(
-                        known, "paused" if self._paused else "running", "" if known else "pause, resume"
-                    )
-                )
-            )
+            self._paused = command is Command.PAUSE or (self._paused and command is not Command.RESUME)
+            self._stopping |= command in (Command.STOP, Command.DRAIN)
+            request.reply(encode(ControlReply(True, self.state, "")))
 
     def _refuse(self, request: Request, reason: object) -> None:
         log.warning("request refused key=%s reason=%s", request.key, reason)
@@ -151,6 +144,10 @@ class GeneratorService:
         )
 
     def _report(self) -> None:
+        self._metrics.follow("topspin_reconnects_total", self._transport.reconnect_count)
+        for name, mailboxes in (("request", self._requests), ("control", [self._control])):
+            dropped = sum(mailbox.dropped for mailbox in mailboxes)
+            self._metrics.follow("topspin_messages_dropped_total", dropped, key=name)
         status = Status(
             role="generator",
             id=self._config.id,

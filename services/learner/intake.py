@@ -44,6 +44,11 @@ class IntakeConfig(BaseModel):
         json_schema_extra={"unit": "s"},
     )
 
+    @property
+    def lag_aimed_at(self) -> int:
+        """Return how many datasets beyond the present one are collected ahead."""
+        return min(self.target_lag, self.max_lag)
+
 
 @dataclass(frozen=True, slots=True)
 class Queued:
@@ -220,9 +225,9 @@ class Intake:
 
     def _wanted(self, now: float) -> int:
         """Return how many more rollouts of today's version would be used within the lag that is aimed at."""
-        lag = min(self._config.target_lag, self._config.max_lag)
         # nothing is collected for after a stage change: it would be lost
-        datasets = min(lag + 1, self._standing.datasets_left) - bool(self._in_update)
+        ahead = min(self._config.lag_aimed_at + 1, self._standing.datasets_left)
+        datasets = ahead - bool(self._in_update)
         promised = sum(
             self._outstanding(account)
             for account in self._accounts.values()

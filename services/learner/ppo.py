@@ -52,10 +52,10 @@ class PPOConfig(BaseModel):
         0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to"
     )
     refit_epochs: int = Field(
-        8,
-        ge=0,
-        le=1000,
-        description="epochs after a stage change in which only the critic learns, the policy held",
+        24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
+    )
+    refit_variance: float = Field(
+        0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
     )
 
 
@@ -149,12 +149,14 @@ def update(
         generator: Shuffles the minibatches.
         explained: Explained variance of the values that the dataset was built with, passed through.
         breathe: Called between gradient steps.
-        hold_policy: Learn the critic alone: KL(prox, new) takes the surrogate's place and keeps the policy where it
-            is while the shared trunk moves. For the first epochs of a stage, whose rewards the critic doesn't know
-            yet: by the old ones it would punish the very contact that leads on to them.
+        hold_policy: Learn the critic alone, the policy's parameters frozen. For the first epochs of a stage, whose
+            rewards the critic doesn't know yet: by the old ones it would punish the very contact that leads on to
+            them.
     """
     count = len(data.obs)
     parameters = list(network.parameters())
+    for parameter in network.policy_parameters():
+        parameter.requires_grad_(not hold_policy)  # a frozen one has no gradient, and Adam leaves it alone
     sums = np.zeros(5)
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
@@ -167,9 +169,7 @@ def update(
             mean, values = network(data.obs[rows])
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
             if hold_policy:
-                loss_policy = kl_divergence(
-                    data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma
-                )
+                loss_policy = torch.zeros(())
             else:
                 loss_policy = policy_loss(
                     log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip

@@ -85,7 +85,9 @@ class Record:
             return
         with self._path.open(newline="") as file:
             lines = file.readlines()
-        kept = lines[:1] + [line for line in lines[1:] if int(line.split(",", 1)[0]) <= epoch]
+        # a learner that was killed may have left half a line at the end
+        rows = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",", 1)[0]) <= epoch]
+        kept = lines[:1] + rows
         self._path.write_text("".join(kept))
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ from importlib.metadata import version as package_version
 from threading import Event
 
 from common.comms.codec import DecodeError, decode_one_of, encode
-from common.comms.keys import KeyPartError, Keys
+from common.comms.keys import Keys
 from common.comms.messages import (
     ActorReport,
     Command,
@@ -22,12 +22,14 @@ from common.comms.messages import (
     Status,
 )
 from common.comms.transport import Flow, Transport
+from common.config import to_toml
 from common.env.robot import home_action
+from common.errors import ReportedError
 from common.metrics import Metrics
 from common.policy.weights import (
     ACTION_CONTRACT,
-    OBSERVATION_CONTRACT,
     Contract,
+    observation_contract,
     pack,
     save_policy,
     task_hash,
@@ -49,6 +51,10 @@ ROLLOUT_MAILBOX = 256  # above all rollouts that actors may have under way: a fu
 SERVED_AT_ONCE = 64  # messages looked at between two gradient steps
 IDLE_WAIT_S = 0.05
 LEARNER_ID = "0"
+
+
+class RunExistsError(ReportedError):
+    """A new run would overwrite an old one's checkpoints."""
 
 
 @dataclass(slots=True)
@@ -82,16 +88,31 @@ class LearnerService:
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
         self._folder = RunFolder.of(config.run, config.folder)
+        if not config.resume and checkpoint.checkpoints(self._folder.checkpoints):
+            raise RunExistsError(
+                f"run {config.run!r} has checkpoints in {self._folder.checkpoints}: "
+                "go on with --resume, or choose another --run"
+            )
         self._folder.create()
+        if not self._folder.config.exists():
+            self._folder.config.write_text(to_toml(config, "learner"))
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
-            config.ppo, config.network, config.curriculum, home_action(config.env.robot), config.seed
+            config.ppo,
+            config.network,
+            config.curriculum,
+            home_action(config.env.robot),
+            config.seed,
+            notice=max(1, config.intake.lag_aimed_at),
+            observation=config.env.observation,
         )
         self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._generation = int(time.time())
         self._stages: list[StageChange] = []
         self._clocks = Clocks(clock())
         memory = self._restore() if config.resume else ()
+        if not config.resume:
+            self._record.truncate(0)  # of a life that ended before its first checkpoint
         self._intake = Intake(config.intake, self._standing(), memory)
         if not self._stages:
             self._note_stage("start")
@@ -140,6 +161,16 @@ class LearnerService:
 
     def run(self, stop: Event) -> None:
         """Train until the budget is spent or ``stop`` is set; the run folder is whole afterwards."""
+        config = self._config
+        log.info(
+            "listening endpoint=%s run=%s epoch=%d of=%d; waiting for actors, start one with: python -m services.actor "
+            "--run %s --endpoint %s (and rallies with: python -m services.generator --run %s --endpoint %s)",
+            config.endpoint,
+            config.run,
+            self.training.progress.epoch,
+            config.curriculum.epochs,
+            *(config.run, config.endpoint) * 2,
+        )
         try:
             while not stop.is_set() and not self.done:
                 wait = self.step()
@@ -161,7 +192,9 @@ class LearnerService:
         if not self._paused:
             dataset = self._intake.take_dataset()
             if dataset:
-                self._train([entry.rollout for entry in dataset])
+                # by number, not by arrival: so the bits of a run with one actor don't hang on the network
+                ordered = sorted(dataset, key=lambda entry: (entry.header.actor, entry.header.sequence))
+                self._train([entry.rollout for entry in ordered])
                 trained = True
         now = self._clock()
         if not trained:
@@ -199,7 +232,7 @@ class LearnerService:
         stats = self.training.run_epoch(rollouts, self._serve)
         clocks, now = self._clocks, self._clock()
         if clocks.first_trained < 0:
-            clocks.first_trained, clocks.next_checkpoint = now, now + self._config.checkpoint_interval_s
+            clocks.first_trained = now
             log.info("first batch trained seconds=%.1f frames=%d", now - clocks.born, stats.frames)
         if stats.stage_changed:
             self._note_stage("curriculum")
@@ -207,6 +240,11 @@ class LearnerService:
         self._publish_policy()
         if stats.stage_changed:
             self._transport.publish(self._keys.stage(), encode(self._stages[-1]), Flow.STAGE)
+            clocks.next_checkpoint = now  # a restart must not lead back into the stage before
+        if not stats.update.finite:
+            log.warning(
+                "an update skipped gradient steps that were not finite epoch=%d", stats.progress.epoch
+            )
         rate = stats.frames / max(now - (clocks.last_trained if clocks.last_trained >= 0 else started), 1e-9)
         clocks.last_trained = now
         self._record.append(row(stats, self.seconds, rate))
@@ -292,7 +330,7 @@ class LearnerService:
         for event in self._members.poll():
             try:
                 member = self._keys.member(event.key)
-            except KeyPartError as error:
+            except ValueError as error:  # KeyPartError, or digits that are no number
                 self._refused("alive", error)
                 continue
             (self._alive.add if event.alive else self._alive.discard)(
@@ -305,7 +343,9 @@ class LearnerService:
             if request is None:
                 break
             self._metrics.inc("topspin_bytes_received_total", len(request.payload))
-            opened = open_rollout(request.payload, self._config.max_message_mib * 2**20)
+            opened = open_rollout(
+                request.payload, self._config.max_message_mib * 2**20, self.training.obs_size
+            )
             if opened is None:
                 self._refused("rollout", "unreadable")
                 verdict = self._intake.unreadable("not readable as a rollout of this release")
@@ -347,11 +387,8 @@ class LearnerService:
         actors = sum(role == "actor" for role, _, _ in self._alive)
         if actors == 0:
             log.warning(
-                "waiting for=actors listening=%s; start one with: python -m services.actor --run %s --endpoint %s "
-                "(and rallies with: python -m services.generator --run %s --endpoint %s)",
-                self._config.endpoint,
-                self._config.run,
-                self._config.endpoint,
+                "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s --endpoint %s",
+                now - since,
                 self._config.run,
                 self._config.endpoint,
             )
@@ -368,7 +405,8 @@ class LearnerService:
     def _contract(self) -> Contract:
         config, progress = self._config, self.training.progress
         return Contract(
-            observation=OBSERVATION_CONTRACT,
+            observation=observation_contract(config.env.observation),
+            observation_options=config.env.observation,
             action=ACTION_CONTRACT,
             network=config.network,
             control_rate_hz=config.env.control_rate_hz,
@@ -389,6 +427,7 @@ class LearnerService:
         m.inc("topspin_frames_total", stats.frames)
         m.inc("topspin_episodes_total", int(play.outcomes.sum()))
         m.inc("topspin_phase_seconds_total", update_s, phase="update")
+        m.observe("topspin_update_seconds", update_s)
         for outcome in Outcome:
             if outcome is not Outcome.NONE and play.outcomes[outcome]:
                 m.inc("topspin_outcomes_total", int(play.outcomes[outcome]), outcome=outcome.name.lower())
@@ -439,6 +478,9 @@ class LearnerService:
         }
         for fate, count in fates.items():
             self._metrics.set("topspin_ledger_rollouts", count, fate=fate)
+        self._metrics.follow("topspin_reconnects_total", self._transport.reconnect_count)
+        for name, mailbox in (("rollout", self._rollouts), ("control", self._control)):
+            self._metrics.follow("topspin_messages_dropped_total", mailbox.dropped, key=name)
         self._metrics.set("topspin_queue_depth", self._intake.queued)
         self._metrics.set("topspin_rollout_gaps", self._intake.gaps())
         for role in ("generator", "actor", "evaluator"):

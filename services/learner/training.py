@@ -11,7 +11,7 @@ from common.comms.messages import Rollout
 from common.policy.actor_critic import ActorCritic, NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
-from common.rally.observation import OBSERVATION_SIZE
+from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
 from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
@@ -34,6 +34,8 @@ class Progress:
     epochs_in_stage: int = 0
     learning_rate: float = 5e-4
     catch_rate: float = float("nan")  # running, with exploration noise
+    refitting: bool = False  # the stage has changed, and the critic learns its rewards first
+    closing: int = 0  # datasets that the stage still takes once its gate has opened; 0: it hasn't
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,8 @@ class Training:
         curriculum: Stage lengths.
         home_action: Initial bias of the mean head (7,).
         seed: Of the network's start and the minibatches' shuffle.
+        notice: Datasets that a stage still takes after its gate has opened: those that are being collected then.
+        observation: What policy and critic see.
     """
 
     def __init__(
@@ -103,17 +107,21 @@ class Training:
         curriculum: CurriculumConfig,
         home_action: Floats,
         seed: int,
+        notice: int = 1,
+        observation: ObservationConfig = PAPER_OBSERVATION,
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
             torch.manual_seed(seed)
-            self.network: ActorCritic = new_network(network, home_action)
+            self.network: ActorCritic = new_network(network, observation, home_action)
         self.network_config = network
+        self.obs_size = size(critic_layout(observation))
         self.ppo = ppo
         self.curriculum = curriculum
+        self.notice = notice
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
         self.generator = torch.Generator().manual_seed(seed)
-        self.obs_moments = Moments.initial(OBSERVATION_SIZE)
+        self.obs_moments = Moments.initial(self.obs_size)
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
         self.progress = Progress(stage=curriculum.first_stage, learning_rate=ppo.learning_rate)
 
@@ -121,10 +129,14 @@ class Training:
     def datasets_left(self) -> int:
         """How many datasets the present stage still takes, the next one included; at least 1.
 
-        A gate may end stage 1 earlier: it speaks a dataset ahead, so that none is collected in vain.
+        A gate may end stage 1 earlier: it speaks ``notice`` datasets ahead, so that none is collected in vain.
         """
-        lengths = (self.curriculum.stage_1, self.curriculum.stage_2, self.curriculum.stage_3)
-        return max(1, lengths[self.progress.stage - 1] - self.progress.epochs_in_stage)
+        config, progress = self.curriculum, self.progress
+        if progress.closing:
+            return progress.closing
+        if progress.stage == 3:  # the last stage also takes the epochs that a gate has saved
+            return max(1, config.epochs - progress.epoch)
+        return max(1, (config.stage_1, config.stage_2)[progress.stage - 1] - progress.epochs_in_stage)
 
     def run_epoch(
         self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None
@@ -144,27 +156,41 @@ class Training:
             self.ppo.learning_rate_min,
             self.curriculum,
         )
+        # A value that explains the new rewards is what the policy waits for after a stage change.
+        is_refitting = before.refitting and (
+            before.epochs_in_stage < self.ppo.refit_epochs and explained < self.ppo.refit_variance
+        )
         stats = update(
             self.network,
             self.optimizer,
             data,
             self.ppo,
-            min(before.learning_rate, bound),
+            bound if is_refitting else min(before.learning_rate, bound),
             bound,
             self.generator,
             explained,
             breathe,
-            hold_policy=before.stage_number > 0 and before.epochs_in_stage < self.ppo.refit_epochs,
+            hold_policy=is_refitting,
         )
+        frozen = self.obs_moments
         for rollout in rollouts:
-            self.obs_moments = self.obs_moments.merged(Moments.of(rollout.obs.reshape(-1, OBSERVATION_SIZE)))
+            self.obs_moments = self.obs_moments.merged(Moments.of(rollout.obs.reshape(-1, self.obs_size)))
             breathe()
+        if before.stage_number > 0:
+            # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset: the
+            # network must not play differently for it.
+            self.network.renormalize(frozen, self.obs_moments)
         play = play_stats(rollouts)
         frames = sum(r.rewards.size for r in rollouts)
         caught = play.caught / play.rallies if play.rallies else before.catch_rate
         old = caught if np.isnan(before.catch_rate) else before.catch_rate
         running = (1 - CATCH_WINDOW) * old + CATCH_WINDOW * caught
-        stage = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
+        # Without a look at the gate: when it opens, rollouts of this stage are on their way, and are trained on first.
+        stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
+        due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
+        closing = before.closing - 1 if before.closing else self.notice if due != stage else 0
+        if before.closing == 1:
+            stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
         if changed:
             self.obs_moments = self.obs_moments.recounted()
@@ -175,8 +201,10 @@ class Training:
             stage=stage,
             stage_number=before.stage_number + changed,
             epochs_in_stage=0 if changed else before.epochs_in_stage + 1,
-            learning_rate=stats.learning_rate,
+            learning_rate=before.learning_rate if is_refitting else stats.learning_rate,
+            refitting=changed or is_refitting,
             catch_rate=running,
+            closing=0 if changed else closing,
         )
         lag = float(np.mean([before.version - r.version for r in rollouts]))
         return EpochStats(self.progress, stats, play, changed, lag, frames)
@@ -189,7 +217,7 @@ class Training:
         with torch.no_grad():
             for r in rollouts:
                 steps, count = r.rewards.shape
-                obs = torch.from_numpy(normalize(r.obs, self.obs_moments).reshape(-1, OBSERVATION_SIZE))
+                obs = torch.from_numpy(normalize(r.obs, self.obs_moments).reshape(-1, self.obs_size))
                 actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
                 mean, value = self.network(obs)
                 values = denormalized(value, self.value_moments).reshape(steps, count)

@@ -8,8 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Final
 
+import numpy as np
+
 from common.comms.codec import DecodeError, decode, salvage
 from common.comms.messages import Rollout, VerdictKind
+from common.rally.reward import TERMS
+from common.rally.trajectory import Outcome
+
+# Far beyond anything a rally can bring: one wild number would stay in the normalisers for good.
+LARGEST: Final = (("obs", 1e4), ("last_obs", 1e4), ("final_obs", 1e4), ("actions", 1e3), ("rewards", 1e5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +109,7 @@ def judge(case: Case) -> tuple[VerdictKind, str]:
     return next((kind, reason) for kind, rule in RULES if (reason := rule(case)))
 
 
-def open_rollout(payload: bytes, limit_bytes: int) -> tuple[Header, Rollout | None] | None:
+def open_rollout(payload: bytes, limit_bytes: int, obs_size: int) -> tuple[Header, Rollout | None] | None:
     """Return what a verdict depends on, and the rollout, or None where it is invalid.
 
     None alone means that nobody can say whose it was.
@@ -114,4 +121,25 @@ def open_rollout(payload: bytes, limit_bytes: int) -> tuple[Header, Rollout | No
         if found.keys() != set(_HEADER_FIELDS):
             return None
         return Header(**found, fault=str(error)), None
-    return Header(**{name: getattr(rollout, name) for name in _HEADER_FIELDS}), rollout
+    header = {name: getattr(rollout, name) for name in _HEADER_FIELDS}
+    if fault := content_fault(rollout, obs_size):
+        return Header(**header, fault=fault), None
+    return Header(**header), rollout
+
+
+def content_fault(rollout: Rollout, obs_size: int) -> str:
+    """Return what keeps a well-formed rollout from being trained on, or ""."""
+    sizes = (
+        ("observations", rollout.obs.shape[-1], obs_size),
+        ("reward terms", rollout.reward_terms.size, len(TERMS)),
+    )
+    for name, got, wanted in sizes:
+        if got != wanted:
+            return f"{got} {name}; allowed: {wanted}"
+    if (wild := rollout.episodes.outcome[rollout.episodes.outcome >= len(Outcome)]).size:
+        return f"outcome {wild[0]}; allowed: 0 to {len(Outcome) - 1}"
+    for name, limit in LARGEST:
+        largest = np.abs(getattr(rollout, name)).max(initial=0.0)
+        if largest > limit:
+            return f"{name} of {largest:g}; allowed: up to {limit:g}"
+    return ""

@@ -11,6 +11,7 @@ from gymnasium.wrappers import vector
 
 from common.env.gym import ENV_ID
 from common.env.rally_env import EnvConfig
+from common.rally.observation import PAPER_OBSERVATION
 from common.rally.trajectory import Outcome
 from tests.unit.env.rallies import make_env
 
@@ -180,7 +181,7 @@ def test_settings_reach_the_environment():
     env = make(stage=1, noise="off", control_rate_hz=200).unwrapped
     env.reset(seed=1)
 
-    assert env._table.env.config == EnvConfig(noise="off", control_rate_hz=200)
+    assert env._table.env.config == EnvConfig(noise="off", control_rate_hz=200, observation=PAPER_OBSERVATION)
     assert env._table.env.stage == 1
 
 

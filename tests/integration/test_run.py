@@ -11,9 +11,7 @@ FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 
 
 def ledger(scraped):
-    return {
-        fate: scraped[f'topspin_ledger_rollouts{{fate="{fate}"}}'] for fate in ("published", *FATES)
-    }
+    return {fate: scraped[f'topspin_ledger_rollouts{{fate="{fate}"}}'] for fate in ("published", *FATES)}
 
 
 def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_path):
@@ -22,7 +20,9 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
         generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
         wait_until(lambda: learner.service.training.progress.stage == 3, 60, "stage 3")
         wait_until(
-            lambda: all(actor.scrape()["topspin_stage"] == 3 for actor in actors), 20, "both actors in stage 3"
+            lambda: all(actor.scrape()["topspin_stage"] == 3 for actor in actors),
+            20,
+            "both actors in stage 3",
         )
         wait_until(lambda: evaluator.service.evaluations >= 1, 30, "an evaluation")
         scraped = [entry.scrape() for entry in (generator, *actors, learner, evaluator)]
@@ -44,5 +44,7 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
     assert [int(row["stage"]) for row in rows] == [1, 1, 2, 2, 3, 3, 3, 3]
     assert max(float(row["lag"]) for row in rows) <= 2
     assert load_policy(tmp_path / "policy" / "latest").contract.version == 8
-    assert json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
+    assert (
+        json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
+    )
     assert list((tmp_path / "tb").iterdir())

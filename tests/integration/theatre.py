@@ -4,9 +4,11 @@ import socket
 import threading
 import time
 import urllib.request
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
+from common.comms.transport import Transport, TransportError
+from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.metrics import Metrics
 from common.policy.actor_critic import NetworkConfig
@@ -49,6 +51,7 @@ class Running:
     service: object
     metrics: Metrics
     port: int
+    transport: Transport
     stop: threading.Event = field(default_factory=threading.Event)
     thread: threading.Thread | None = None
     error: BaseException | None = None
@@ -57,7 +60,7 @@ class Running:
         def work():
             try:
                 self.service.run(self.stop)
-            except BaseException as error:  # noqa: BLE001 - handed to the test's thread
+            except BaseException as error:
                 self.error = error
 
         self.thread = threading.Thread(target=work, daemon=True)
@@ -81,6 +84,10 @@ class Running:
         pairs = (line.rsplit(" ", 1) for line in lines if line and not line.startswith("#"))
         return {name: float(value) for name, value in pairs}
 
+    def metric(self, name, **labels):
+        """Return one of them, 0 if it was never touched."""
+        return self.metrics.value(name, **labels) or 0.0
+
 
 class Stage:
     """Where a test puts its services up; everything is closed at the end."""
@@ -90,6 +97,7 @@ class Stage:
         self.endpoint = free_endpoint()
         self.opened = []
         self.running = []
+        self.peers = []
         self.learner_settings = {
             "network": NETWORK,
             "ppo": PPO,
@@ -103,10 +111,28 @@ class Stage:
     def start(self, make, config, role, *more, run=True):
         transport = open_zenoh(config)
         metrics = Metrics(role, config.id)
-        entry = Running(make(config, transport, metrics, *more), metrics, metrics.serve(0))
         self.opened.append((transport, metrics))
+        entry = Running(make(config, transport, metrics, *more), metrics, metrics.serve(0), transport)
         self.running.append(entry)
         return entry.start() if run else entry
+
+    def take_down(self, entry):
+        """End a service as its process would end, its connection with it."""
+        entry.end()
+        entry.transport.close()
+        entry.metrics.close()
+
+    def cut_off(self, entry):
+        """Take a service's connection away under its hands: to the others it has died without a word."""
+        entry.transport.close()
+        with suppress(TransportError):
+            entry.join()
+
+    def peer(self):
+        """Return the connection of somebody who may send anything."""
+        transport = open_zenoh(ZenohConfig(endpoint=self.endpoint, connect_timeout_s=10.0))
+        self.peers.append(transport)
+        return transport
 
     def learner(self, run=True, **settings):
         values = self.common() | self.learner_settings | {"folder": str(self.folder)} | settings
@@ -121,7 +147,9 @@ class Stage:
             "index": index,
             "shards": 2,
         }
-        return self.start(ActorService, ActorConfig(**(values | settings)), "actor", new_incarnation(), run=run)
+        return self.start(
+            ActorService, ActorConfig(**(values | settings)), "actor", new_incarnation(), run=run
+        )
 
     def generator(self, **settings):
         values = self.common() | {"shards": 2, "batch": 32}
@@ -149,6 +177,8 @@ def stage(folder, **learner):
     try:
         yield theatre
     finally:
+        for transport in theatre.peers:
+            transport.close()
         for entry in reversed(theatre.running):
             entry.stop.set()
             if entry.thread is not None:

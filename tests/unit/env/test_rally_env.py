@@ -11,7 +11,7 @@ from common.physics.table_bounce import table_bounce
 from common.physics.touch import ROBOT_COURT
 from common.rally.launch import draw_rallies
 from common.rally.noise import PROFILES, Condition
-from common.rally.observation import OBSERVATION, offsets
+from common.rally.observation import OBSERVATION, ObservationConfig, critic_layout, offsets, size
 from common.rally.play import MAX_SPEED_REWARDED
 from common.rally.trajectory import Outcome, State
 from tests.unit.env.rallies import QUIET, Deck, make_env, random_actions
@@ -357,17 +357,20 @@ def test_robots_that_go_home_start_within_the_spread():
 
 
 def test_every_number_stays_within_its_stated_range_in_random_play():
-    env = make_env(64, EnvConfig(noise="hard"), rallies=2000)
+    seen = ObservationConfig(history=2, spin=True)
+    layout = critic_layout(seen)
+    at = offsets(layout)
+    env = make_env(64, EnvConfig(noise="hard", observation=seen), rallies=2000)
     env.reset()
     rng = np.random.default_rng(0)
-    low, high = np.full(37, np.inf), np.full(37, -np.inf)
+    low, high = np.full(size(layout), np.inf), np.full(size(layout), -np.inf)
     for _ in range(150):
         obs = env.step(rng.uniform(-1, 1, (64, 7))).obs
         low, high = np.minimum(low, obs.min(axis=0)), np.maximum(high, obs.max(axis=0))
 
-    for part in OBSERVATION:
-        assert low[AT[part.name]].min() >= part.low, part.name
-        assert high[AT[part.name]].max() <= part.high, part.name
+    for part in layout:
+        assert low[at[part.name]].min() >= part.low, part.name
+        assert high[at[part.name]].max() <= part.high, part.name
 
 
 def test_a_fault_of_the_simulation_sends_that_robot_home_and_leaves_its_rally_out_of_the_rates(

@@ -135,8 +135,9 @@ def test_holding_the_policy_fits_the_value_and_leaves_the_actions():
 
     with torch.no_grad():
         mean, value = network(data.obs)
-    assert float(((mean - data.mean_prox) / data.log_sigma_prox.exp()).square().mean()) < 0.01
-    assert float((value - data.value_targets).square().mean()) < 0.7 * float(data.value_targets.var())
+    assert torch.equal(mean, data.mean_prox)
+    assert torch.equal(network.log_sigma, data.log_sigma_prox)
+    assert float((value - data.value_targets).square().mean()) < 0.9 * float(data.value_targets.var())
     assert stats.learning_rate == 1e-3
 
 

@@ -4,7 +4,9 @@ import torch
 
 from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_divergence, log_prob
 from common.policy.d2rl import D2RL
+from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
+from common.rally.observation import ObservationConfig
 
 PAPER_UNITS = (256, 128, 128, 64, 64, 32)
 
@@ -79,3 +81,41 @@ def test_log_probability_entropy_and_divergence_are_the_gaussians():
         kl_divergence(mean, log_sigma, other, log_other),
         torch.distributions.kl_divergence(p, q).sum(-1).mean(),
     )
+
+
+def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(16, 8)), ObservationConfig(critic="privileged"))
+    obs = torch.randn(4, 37 + 17)
+    other = obs.clone()
+    other[:, 37:] = torch.randn(4, 17)
+
+    with torch.no_grad():
+        (mean, value), (mean_other, value_other) = network(obs), network(other)
+        alone = network.act(obs[:, :37])
+
+    assert torch.equal(mean, mean_other)
+    assert torch.equal(mean, alone)
+    assert (value - value_other).abs().min() > 1e-4
+
+
+@pytest.mark.parametrize("critic", ["policy", "privileged"])
+@pytest.mark.parametrize("trunks", ["shared", "separate"])
+def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, critic):
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    config = ObservationConfig(critic=critic)
+    network = new_network(NetworkConfig(units=(32, 16, 8), trunks=trunks), config)
+    width = 37 + 17 * (critic == "privileged")
+    old = Moments(rng.normal(size=width), rng.uniform(0.5, 2.0, size=width), 1)
+    new = Moments(old.mean + 0.3 * rng.normal(size=width), old.var * rng.uniform(0.5, 2.0, size=width), 1)
+    raw = (old.mean + 0.5 * rng.normal(size=(64, width))).astype(np.float32)
+
+    with torch.no_grad():
+        before = network(torch.from_numpy(normalize(raw, old)))
+        changed = network(torch.from_numpy(normalize(raw, new)))
+        network.renormalize(old, new)
+        after = network(torch.from_numpy(normalize(raw, new)))
+
+    torch.testing.assert_close(after, before, atol=2e-5, rtol=1e-4)
+    assert (changed[1] - before[1]).abs().max() > 0.01

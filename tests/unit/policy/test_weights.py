@@ -9,24 +9,26 @@ from common.policy.normalizer import Moments
 from common.policy.weights import (
     ACTION_CONTRACT,
     CONTRACT_FILE,
-    OBSERVATION_CONTRACT,
     WEIGHTS_FILE,
     Contract,
     PolicyError,
     load_policy,
     new_network,
+    observation_contract,
     pack,
     save_policy,
     task_hash,
     unpack,
 )
+from common.rally.observation import PAPER_OBSERVATION
 
 SMALL = NetworkConfig(units=(16, 8))
 
 
 def make_contract(**changes):
     values = {
-        "observation": OBSERVATION_CONTRACT,
+        "observation": observation_contract(PAPER_OBSERVATION),
+        "observation_options": PAPER_OBSERVATION,
         "action": ACTION_CONTRACT,
         "network": SMALL,
         "control_rate_hz": 50.0,
@@ -44,7 +46,7 @@ def make_contract(**changes):
 
 def saved(folder):
     torch.manual_seed(1)
-    network = new_network(SMALL, np.full(7, 0.3, np.float32))
+    network = new_network(SMALL, home_action=np.full(7, 0.3, np.float32))
     moments = Moments(np.linspace(-1, 1, 37), np.linspace(0.5, 2, 37), 123_456_789_012)
     save_policy(folder, network, moments, make_contract())
     return network, moments

@@ -5,10 +5,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.env.local_rallies import LocalRallies
+from common.env.rally_env import EnvConfig, RallyEnv
 from common.physics.arm import racket_motion, racket_pose
 from common.rally import play
 from common.rally.noise import PROFILES
-from common.rally.observation import ACTION, OBSERVATION, markdown, offsets, size
+from common.rally.observation import (
+    ACTION,
+    OBSERVATION,
+    PAPER_OBSERVATION,
+    ObservationConfig,
+    critic_layout,
+    markdown,
+    offsets,
+    policy_layout,
+    size,
+)
 from common.rally.trajectory import State
 from tests.unit.rally.scripted import HOME, begin, make_motion, make_record, make_rules
 
@@ -22,7 +34,7 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
     start = np.array(joints) - 0.02 * np.array(rates)
     play.play_step(rallies, make_motion(start, joints), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
     out = np.empty((1, 37), np.float32)
-    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), out)
+    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), False, False, out)
     return out[0]
 
 
@@ -107,3 +119,46 @@ def test_near_home_the_quaternion_moves_without_jumps_of_sign():
 
 def test_the_documented_layout_is_the_real_one():
     assert (Path(__file__).parents[3] / "docs" / "observation.md").read_text() == markdown()
+
+
+@pytest.mark.parametrize("history", [0, 1, 5])
+@pytest.mark.parametrize("spin", [False, True])
+@pytest.mark.parametrize("critic", ["policy", "privileged"])
+def test_options_only_add_numbers_behind_the_papers(history, spin, critic):
+    config = ObservationConfig(history=history, spin=spin, critic=critic)
+
+    assert policy_layout(config)[: len(OBSERVATION)] == OBSERVATION
+    assert critic_layout(config)[: len(policy_layout(config))] == policy_layout(config)
+    assert size(policy_layout(config)) == 37 + 3 * spin + 6 * history
+    assert size(critic_layout(config)) - size(policy_layout(config)) == 17 * (critic == "privileged")
+
+
+def played(config, steps=12, noise="standard"):
+    """Return the observations (steps + 1, D) of one ball, and what was really so (steps + 1, 9)."""
+    env = RallyEnv(1, EnvConfig(observation=config, noise=noise), LocalRallies(seed=3, noise=noise))
+    observations, truth = [env.reset()[0]], [env.rallies.ball[0].copy()]
+    for _ in range(steps):
+        observations.append(env.step(env.robot.home_action[None]).obs[0])
+        truth.append(env.rallies.ball[0].copy())
+    return np.array(observations), np.array(truth)
+
+
+def test_the_memory_holds_what_was_seen_before_newest_first():
+    observations, _ = played(ObservationConfig(history=3, critic="policy"))
+    seen = observations[:, 24:30]
+
+    for age in (1, 2, 3):
+        earlier = observations[:, 37 + 6 * (age - 1) : 37 + 6 * age]
+        np.testing.assert_array_equal(earlier[age:], seen[:-age])
+        np.testing.assert_array_equal(earlier[0], seen[0])  # before the launch there was nothing else to see
+
+
+def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():
+    paper, _ = played(PAPER_OBSERVATION)
+    all_, truth = played(ObservationConfig(spin=True))
+
+    np.testing.assert_array_equal(all_[:, :37], paper)
+    np.testing.assert_allclose(all_[:, 37:40], truth[:, 6:9], rtol=1e-6)  # option spin
+    np.testing.assert_allclose(all_[:, 40:49], truth, rtol=1e-6)
+    assert np.abs(all_[3:, 24:27] - truth[3:, :3]).max() > 0.01  # what the policy sees is late and noisy
+    assert (all_[:, 49:57] == all_[0, 49:57]).all()  # conditions hold for a rally

@@ -12,6 +12,7 @@ from services.learner.ledger import Account, Fate, Remembered, restored, spans
 from services.learner.verdicts import RULES, open_rollout
 from tests.unit.comms.message_examples import make_rollout
 from tests.unit.comms.test_codec import sealed
+from tests.unit.learner.rollouts import make_rollout as make_full_rollout
 from tests.unit.services.accounting import ROLLOUT, STANDING, make_header, make_intake
 
 LIMIT = 2**20
@@ -182,13 +183,13 @@ def test_a_rollout_that_cannot_be_read_is_named_if_its_header_can():
     fields["log_mu"] = 3
     payload = sealed(msgpack.packb([kind, version, fields]))
 
-    header, rollout = open_rollout(payload, LIMIT)
+    header, rollout = open_rollout(payload, LIMIT, 37)
 
     assert rollout is None
     assert (header.actor, header.sequence) == ("actor-0", 11)
     assert "Rollout.log_mu: 3" in header.fault
-    assert open_rollout(payload[:-1], LIMIT) is None
-    header, rollout = open_rollout(encode(make_rollout()), LIMIT)
+    assert open_rollout(payload[:-1], LIMIT, 37) is None
+    header, rollout = open_rollout(encode(make_full_rollout(sequence=11)), LIMIT, 37)
     assert header.fault == ""
     assert rollout.sequence == 11
 

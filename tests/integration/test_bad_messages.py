@@ -1,0 +1,244 @@
+"""Messages that no service of ours would send: each is refused by its reason, and work goes on."""
+
+import dataclasses
+
+import msgpack
+import numpy as np
+from theatre import CURRICULUM, stage, wait_until
+
+from common.comms.codec import decode, encode
+from common.comms.keys import Keys
+from common.comms.messages import PolicySnapshot, RallyBatch, StageChange, Status, Verdict
+from common.comms.transport import Flow, NoReply
+from common.env.rally_env import EnvConfig
+from common.policy.weights import load_tensors, save_tensors
+from common.rally.observation import PAPER_OBSERVATION
+from tests.unit.comms.test_codec import sealed
+from tests.unit.learner.rollouts import make_rollout
+
+KEYS = Keys("test")
+PAPER = EnvConfig(observation=PAPER_OBSERVATION)  # as the strangers' rollouts have it
+LONG = CURRICULUM.model_copy(update={"stage_1": 500})
+
+
+class Stranger:
+    """Somebody with a connection who knows how to write a rollout."""
+
+    def __init__(self, transport):
+        self.transport = transport
+        self.sent = 0
+
+    def policy(self):
+        return decode(
+            self.transport.request(KEYS.policy(), b"", 5.0, Flow.POLICY).wait().payload, PolicySnapshot
+        )
+
+    def rollout(self, **changes):
+        """Return one that the learner would take, but for ``changes``."""
+        newest, values = self.policy(), {"actor": "stranger", "run": "test", "sequence": self.sent}
+        for name in ("generation", "version", "stage_number", "contract_hash"):
+            values[name] = getattr(newest, name)
+        self.sent += 1
+        return make_rollout(**(values | changes))
+
+    def send(self, payload, key=None):
+        return self.transport.request(key or KEYS.rollout(), payload, 5.0, Flow.ROLLOUT).wait()
+
+    def verdict(self, payload):
+        return decode(self.send(payload).payload, Verdict)
+
+
+def nan_in(array):
+    spoilt = array.copy()
+    spoilt.flat[7] = np.nan
+    return spoilt
+
+
+def reworded(payload, change):
+    """Return a rollout's bytes after ``change`` to its [type, version, fields], sealed anew."""
+    content = msgpack.unpackb(payload[12:])
+    change(content)
+    return sealed(msgpack.packb(content))
+
+
+def test_the_learner_refuses_each_bad_rollout_by_its_reason_and_trains_on(tmp_path):
+    with stage(tmp_path, curriculum=LONG, env=PAPER) as s:
+        learner = s.learner()
+        stranger = Stranger(s.peer())
+        for _ in range(4):  # versions to be behind of
+            assert stranger.verdict(encode(stranger.rollout())).kind == "accepted"
+            assert stranger.verdict(encode(stranger.rollout())).kind == "accepted"
+            version = stranger.sent // 2
+            wait_until(lambda v=version: stranger.policy().version == v, 20, "the update")
+        newest = stranger.policy()
+        whole = encode(stranger.rollout())
+        spoilt = bytearray(whole)
+        spoilt[len(whole) // 2] ^= 1
+        bad = [
+            ("stale_stage", "stage number 7; allowed: 0", encode(stranger.rollout(stage_number=7))),
+            ("too_old", "allowed lag: 2", encode(stranger.rollout(version=newest.version - 3))),
+            ("invalid", "the newest is", encode(stranger.rollout(version=newest.version + 1))),
+            ("wrong_contract", "contract c0de", encode(stranger.rollout(contract_hash="c0de"))),
+            ("wrong_generation", "generation 3", encode(stranger.rollout(generation=3))),
+            ("wrong_run", "run other", encode(stranger.rollout(run="other"))),
+            ("invalid", "Rollout.obs", encode(stranger.rollout(obs=nan_in(make_rollout().obs)))),
+            (
+                "invalid",
+                "Rollout.rewards",
+                encode(stranger.rollout(rewards=make_rollout().rewards + np.float32(np.inf))),
+            ),
+            ("invalid", "36 observations; allowed: 37", encode(narrower(stranger.rollout()))),
+            ("invalid", "3 reward terms", encode(stranger.rollout(reward_terms=np.zeros(3, np.float32)))),
+            (
+                "invalid",
+                "rewards of 1e+30",
+                encode(stranger.rollout(rewards=np.full((16, 8), 1e30, np.float32))),
+            ),
+            ("invalid", "outcome 200", encode(stranger.rollout(episodes=wild_outcome()))),
+            ("invalid", "version 99", reworded(encode(stranger.rollout()), lambda c: c.__setitem__(1, 99))),
+            ("unreadable", "not readable", bytes(spoilt)),
+            ("unreadable", "not readable", b""),
+            ("unreadable", "not readable", encode(status())),
+        ]
+        before = dict(learner.scrape())
+        verdicts = [stranger.verdict(payload) for _, _, payload in bad]
+        after = learner.scrape()
+        refusal = stranger.send(b"nonsense", KEYS.ctl("learner", "0"))
+        token = stranger.transport.declare_alive("topspin/v1/test/alive/actor/x/²")
+        wait_until(
+            lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1, 5, "the wild token"
+        )
+        token.close()
+        for _ in range(2):
+            stranger.verdict(encode(stranger.rollout()))
+        wait_until(lambda: stranger.policy().version == newest.version + 1, 20, "one more update")
+        learner.end()
+        ledger = learner.service.ledger()
+
+    assert [verdict.kind.value for verdict in verdicts] == [kind for kind, _, _ in bad]
+    for verdict, (_, reason, _) in zip(verdicts, bad, strict=True):
+        assert reason in verdict.reason
+    for kind in {kind for kind, _, _ in bad}:
+        name = f'topspin_rollouts_received_total{{verdict="{kind}"}}'
+        assert after[name] - before.get(name, 0.0) == sum(k == kind for k, _, _ in bad)
+    assert refusal is NoReply.NO_SERVER
+    assert ledger.balance == 0
+    assert ledger.trained == 10
+    assert ledger.lost == 0
+
+
+def test_a_message_over_the_limit_is_not_taken_in_and_others_are_still_served(tmp_path):
+    with stage(tmp_path, curriculum=LONG, env=PAPER, max_message_mib=1) as s:
+        learner = s.learner()
+        stranger, other = Stranger(s.peer()), Stranger(s.peer())
+        big = encode(stranger.rollout(**{n: getattr(make_rollout(steps=128, envs=96), n) for n in BLOCK}))
+        outcome = stranger.transport.request(KEYS.rollout(), big, 2.0, Flow.ROLLOUT).wait()
+        for _ in range(2):
+            assert other.verdict(encode(other.rollout())).kind == "accepted"
+        wait_until(lambda: other.policy().version == 1, 20, "an update")
+        learner.end()
+
+    assert len(big) > 2**20
+    assert isinstance(outcome, NoReply) or decode(outcome.payload, Verdict).kind == "invalid"
+    assert learner.service.ledger().balance == 0
+
+
+def test_workers_refuse_what_they_cannot_use_and_play_on(tmp_path):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        actor, evaluator = s.actor(shards=1), s.evaluator(interval_s=0.1)
+        wait_until(lambda: learner.service.training.progress.epoch >= 2, 60, "training")
+        stranger = Stranger(s.peer())
+        publish, request = stranger.transport.publish, stranger.transport.request
+        newest = stranger.policy()
+        tensors = {name: np.full_like(value, np.nan) for name, value in load_tensors(newest.weights).items()}
+        higher = {"generation": newest.generation + 9, "version": 10**6}
+        bad_policies = [
+            encode(dataclasses.replace(newest, **higher, weights=save_tensors(tensors))),
+            encode(dataclasses.replace(newest, **higher, weights=b"rubbish")),
+            encode(dataclasses.replace(newest, **higher, obs_mean=np.zeros(3), obs_var=np.ones(3))),
+            encode(newest)[:-9],
+        ]
+
+        def refused(entry, kind):
+            return entry.metric("topspin_messages_refused_total", kind=kind)
+
+        for payload in bad_policies:
+            for entry in (actor, evaluator):
+                seen = refused(entry, "policy")
+                wait_until(
+                    lambda e=entry, n=seen, p=payload: (
+                        publish(KEYS.policy(), p, Flow.POLICY),
+                        refused(e, "policy") > n,
+                    )[1],
+                    20,
+                    f"{type(entry.service).__name__} to refuse a policy",
+                )
+        publish(KEYS.stage(), b"nonsense", Flow.STAGE)
+        publish(KEYS.stage(), encode(StageChange("test", 1, 50, 3, 0, 0, "a lie")), Flow.STAGE)
+        publish(KEYS.rally(0), b"nonsense", Flow.RALLY)
+        publish(KEYS.rally(0), encode(wild_rallies()), Flow.RALLY)
+        for role in ("actor", "evaluator", "generator"):
+            assert request(KEYS.ctl(role, "0"), b"nonsense", 5.0, Flow.CONTROL).wait() is NoReply.NO_SERVER
+        request(KEYS.rally(0), b"nonsense", 5.0, Flow.RALLY).wait()
+        wait_until(lambda: refused(actor, "stage") == 1, 10, "the actor to refuse a stage")
+        wait_until(lambda: refused(actor, "rally") >= 1, 30, "the actor to refuse rallies")
+        epoch, evaluations = learner.service.training.progress.epoch, evaluator.service.evaluations
+        wait_until(lambda: learner.service.training.progress.epoch > epoch + 3, 30, "more training")
+        wait_until(lambda: evaluator.service.evaluations > evaluations, 30, "another evaluation")
+        actor.end()
+        learner.end()
+
+    assert learner.service.ledger().balance == 0
+    assert learner.service.ledger().lost == 0
+
+
+BLOCK = (  # the fields of a rollout whose size is that of its block
+    "obs",
+    "actions",
+    "log_mu",
+    "values",
+    "rewards",
+    "terminated",
+    "truncated",
+    "final_obs",
+    "final_index",
+    "last_obs",
+    "rally_flags",
+)
+
+
+def narrower(rollout):
+    return dataclasses.replace(
+        rollout,
+        obs=np.ascontiguousarray(rollout.obs[..., :36]),
+        last_obs=np.ascontiguousarray(rollout.last_obs[..., :36]),
+        final_obs=np.ascontiguousarray(rollout.final_obs[..., :36]),
+    )
+
+
+def wild_outcome():
+    episodes = make_rollout().episodes
+    return dataclasses.replace(episodes, outcome=np.full_like(episodes.outcome, 200))
+
+
+def wild_rallies():
+    rallies = np.zeros((4, 11))
+    rallies[:, 3] = 1e200
+    return RallyBatch(
+        source="wild",
+        incarnation=1,
+        sequence=0,
+        shard=0,
+        block=0,
+        rallies=rallies,
+        seeds=np.arange(4, dtype=np.uint64),
+        candidates=4,
+        preset="paper",
+        noise="standard",
+    )
+
+
+def status():
+    return Status("actor", "0", 1, 1.8e9, "playing", {}, {})

@@ -1,0 +1,255 @@
+"""Services that come late, die, come back or are missing: nobody waits for ever, and every rollout is accounted for."""
+
+import logging
+import threading
+
+import numpy as np
+import pytest
+import torch
+from theatre import CURRICULUM, free_endpoint, stage, wait_until
+
+from common.comms.messages import VerdictKind
+from common.comms.transport import TransportError
+from common.comms.zenoh_config import ZenohConfig
+from common.comms.zenoh_transport import open_zenoh
+from common.policy.weights import load_policy
+from services.actor.service import NoRalliesError
+from services.learner.intake import IntakeConfig
+from services.learner.service import RunExistsError
+
+LONG = CURRICULUM.model_copy(update={"stage_3": 500})
+SYNCHRONOUS = {"intake": IntakeConfig(dataset_rollouts=2, max_lag=0)}
+
+
+def progress(learner):
+    return learner.service.training.progress
+
+
+def state_of(training):
+    """Return everything that decides how training goes on, as arrays."""
+    state = {f"network.{name}": value.numpy().copy() for name, value in training.network.state_dict().items()}
+    for index, values in training.optimizer.state_dict()["state"].items():
+        state |= {f"adam.{index}.{name}": value.numpy().copy() for name, value in values.items()}
+    for name in ("obs_moments", "value_moments"):
+        moments = getattr(training, name)
+        state |= {f"{name}.{part}": np.array(getattr(moments, part)) for part in ("mean", "var", "count")}
+    state["shuffle"] = training.generator.get_state().numpy().copy()
+    return state
+
+
+def assert_same_state(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, other[name], err_msg=name)
+
+
+def test_an_actor_that_comes_late_gets_policy_and_stage_and_takes_part(tmp_path):
+    with stage(tmp_path, curriculum=CURRICULUM.model_copy(update={"stage_2": 500})) as s:
+        learner = s.learner()
+        s.generator()
+        first = s.actor(0)
+        wait_until(lambda: progress(learner).stage == 2, 60, "stage 2")
+        late = s.actor(1)
+        wait_until(lambda: late.service.counts.accepted >= 2, 30, "the late actor's rollouts")
+        seen = (late.metric("topspin_stage"), late.metric("topspin_policy_version"))
+        first.end()
+        late.end()
+        learner.end()
+        refused = late.service.counts.refused
+
+    assert seen[0] == 2
+    assert seen[1] >= 3
+    assert refused == {}
+    assert learner.service.ledger().lost == 0
+    assert learner.service.ledger().balance == 0
+
+
+def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_path):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        victim, other = s.actor(0), s.actor(1)
+        wait_until(lambda: victim.service.counts.accepted >= 4, 60, "some rollouts")
+        s.cut_off(victim)
+        wait_until(lambda: learner.metric("topspin_alive", role="actor") == 1, 10, "the learner to notice")
+        epoch = progress(learner).epoch
+        wait_until(lambda: progress(learner).epoch >= epoch + 4, 30, "training to go on")
+        again = s.actor(0)
+        wait_until(lambda: again.service.counts.accepted >= 2, 30, "its next life")
+        other.end()
+        again.end()
+        learner.end()
+        ledger = learner.service.ledger()
+        published = sum(entry.service.counts.published for entry in (victim, other, again))
+
+    assert ledger.balance == 0
+    # what it had numbered and never sent, nobody knows of
+    assert published - 2 <= ledger.published <= published
+    assert ledger.lost <= 2
+    assert ledger.refused == {}
+
+
+def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp_path):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        actors = [s.actor(0), s.actor(1)]
+        wait_until(lambda: progress(learner).epoch >= 7, 60, "stage 3")
+        s.take_down(learner)
+        before, trained = learner.service.training, learner.service.ledger().trained
+
+        again = s.learner(run=False, resume=True)
+        after = again.service.training
+        assert after.progress == before.progress
+        assert_same_state(state_of(before), state_of(after))
+        assert again.service.ledger().trained == trained
+        again.start()
+        wait_until(lambda: after.progress.epoch >= before.progress.epoch + 4, 30, "training to go on")
+        for actor in actors:
+            wait_until(
+                lambda a=actor: a.metric("topspin_policy_version") > before.progress.version, 10, "its policy"
+            )
+            actor.end()
+        again.end()
+        ledger = again.service.ledger()
+        counts = [actor.service.counts for actor in actors]
+        reconnects = [actor.metric("topspin_reconnects_total") for actor in actors]
+
+    assert ledger.balance == 0
+    assert (
+        ledger.trained == 2 * after.progress.epoch
+    )  # a rollout that was trained twice would be one too many
+    assert ledger.published == sum(count.published for count in counts)
+    assert all(count.balance == 0 and count.in_flight == 0 for count in counts)
+    assert set(ledger.refused) <= {VerdictKind.WRONG_GENERATION}
+    assert min(reconnects) >= 1
+
+
+def test_a_second_run_does_not_overwrite_the_first_ones_checkpoints(tmp_path):
+    with stage(tmp_path) as s:
+        s.take_down(s.learner())
+        with pytest.raises(RunExistsError, match="go on with --resume, or choose another --run"):
+            s.learner()
+
+
+def synchronous_run(folder, gate=0.0):
+    with stage(folder, curriculum=CURRICULUM.model_copy(update={"catch_gate": gate}), **SYNCHRONOUS) as s:
+        learner = s.learner()
+        s.generator(shards=1)
+        actor = s.actor(shards=1, rallies="ask")
+        learner.join(60)
+        actor.end()
+        return learner.service, actor.service
+
+
+def test_a_seeded_synchronous_run_is_reproducible_bit_for_bit(tmp_path):
+    one, actor = synchronous_run(tmp_path / "one")
+    other, _ = synchronous_run(tmp_path / "other")
+
+    assert one.training.progress == other.training.progress
+    assert one.training.progress.stage_number == 2
+    assert_same_state(state_of(one.training), state_of(other.training))
+    assert actor.counts.refused == {}
+    assert one.ledger().lost == one.ledger().in_flight == 0
+    assert actor._buffer.counts.underruns == 0
+    contracts = [load_policy(tmp_path / name / "policy" / "latest") for name in ("one", "other")]
+    weights = [torch.cat([p.flatten() for p in policy.network.parameters()]) for policy in contracts]
+    assert torch.equal(*weights)
+
+
+def test_a_gate_ends_a_stage_early_and_no_accepted_rollout_is_lost(tmp_path):
+    curriculum = CURRICULUM.model_copy(
+        update={"stage_1": 400, "stage_2": 4, "stage_3": 4, "catch_gate": 1e-6}
+    )
+    with stage(tmp_path, curriculum=curriculum, frames=20_000) as s:
+        learner = s.learner()
+        s.generator()
+        actors = [s.actor(0, envs=32), s.actor(1, envs=32)]
+        learner.join(90)
+        for actor in actors:
+            actor.end()
+        ledger = learner.service.ledger()
+
+    assert progress(learner).stage > 1
+    assert progress(learner).epoch < 400
+    assert ledger.balance == 0
+    assert (ledger.lost, ledger.refused) == (0, {})
+
+
+def test_a_reproducible_actor_says_that_its_generator_is_missing(tmp_path):
+    with stage(tmp_path, **SYNCHRONOUS) as s:
+        learner = s.learner()
+        generator = s.generator(shards=1, batch=1)
+        actor = s.actor(shards=1, rallies="ask", rally_wait_s=1.0, envs=4)
+        wait_until(lambda: actor.service.frames > 0, 60, "the first rollout")
+        s.take_down(generator)
+        with pytest.raises(
+            NoRalliesError, match=r"no rally block \d+ of shard 0 in 1 s.*services\.generator"
+        ):
+            actor.join(60)
+        learner.end()
+
+
+def test_a_generator_idles_while_nobody_listens(tmp_path):
+    with stage(tmp_path) as s:
+        s.learner()
+        generator = s.generator()
+        wait_until(
+            lambda: generator.service.state == "idle" and generator.service._next_status > 0, 10, "idleness"
+        )
+        silent = generator.scrape()["topspin_rallies_published_total"]
+        subscription = s.peer().subscribe("topspin/v1/test/rally/1", capacity=8)
+        assert subscription.wait(10.0)
+        wait_until(lambda: generator.metric("topspin_rallies_published_total") >= 32, 10, "its first batch")
+        subscription.close()
+        wait_until(lambda: generator.service.state == "idle", 10, "idleness again")
+
+    assert silent == 0
+
+
+def test_who_finds_no_learner_says_whom_it_waits_for_and_ends_with_one_line(caplog):
+    endpoint = free_endpoint()
+    with (
+        caplog.at_level(logging.INFO),
+        pytest.raises(
+            TransportError, match=f"no hub answered at {endpoint} in 1 s: start the learner"
+        ) as caught,
+    ):
+        open_zenoh(ZenohConfig(endpoint=endpoint, connect_timeout_s=1.0), threading.Event())
+
+    assert "\n" not in str(caught.value)
+    assert f"waiting for the hub endpoint={endpoint}" in caplog.text
+
+
+def test_the_learner_says_where_it_listens_and_the_command_that_starts_actors(tmp_path, caplog):
+    with caplog.at_level(logging.INFO), stage(tmp_path, silence_warning_s=0.1) as s:
+        learner = s.learner()
+        wait_until(lambda: "waiting for=actors" in caplog.text, 5, "the learner to say whom it waits for")
+        learner.end()
+
+    assert f"listening endpoint={s.endpoint}" in caplog.text
+    assert f"python -m services.actor --run test --endpoint {s.endpoint}" in caplog.text
+
+
+def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        evaluator = s.evaluator()
+        wait_until(
+            lambda: progress(learner).stage == 3 and evaluator.service.evaluations > 1, 60, "an evaluation"
+        )
+        wait_until((tmp_path / "policy" / "best").exists, 10, "a best policy")
+        s.take_down(evaluator)
+        best = load_policy(tmp_path / "policy" / "best").contract
+        again = s.evaluator()
+        wait_until(lambda: again.service.evaluations >= 1, 30, "an evaluation of the next life")
+        s.take_down(again)
+        kept = load_policy(tmp_path / "policy" / "best").contract
+
+    def score(contract):
+        return contract.stage, contract.measures["return_rate" if contract.stage == 3 else "catch_rate"]
+
+    assert score(kept) >= score(best)
+    assert again.service._best is not None

@@ -1,0 +1,156 @@
+"""What a person can get wrong: an exit status and one clear line each, no traceback, nothing left behind."""
+
+import re
+import socket
+
+import pytest
+from commands import run, running, wait_until
+
+from common.comms.zenoh_config import ZenohConfig
+from common.comms.zenoh_transport import open_zenoh
+
+DEPLOY, LEARNER, ACTOR, EVALUATOR = (
+    "deploy.local",
+    "services.learner",
+    "services.actor",
+    "services.evaluator",
+)
+
+
+def one_line(folder, module, *arguments):
+    """Return the status and the last line of a command that must fail with one line of its own."""
+    status, out, err = run(folder, module, *arguments, timeout_s=60)
+    lines = err.strip().splitlines()
+    assert status not in (0, None), err
+    assert "Traceback" not in err
+    assert out == ""
+    assert sum(line.startswith(f"python -m {module}: ") for line in lines) == 1, err
+    return status, lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("module", "flags", "status", "line"),
+    [
+        (DEPLOY, "--actor 3", 2, r"unknown flag --actor; did you mean '--actors'\?"),
+        (
+            DEPLOY,
+            "--actors many",
+            2,
+            r"local.actors = 'many' \(--actors\); allowed: a whole number from 1 to 1000",
+        ),
+        (DEPLOY, "--actors 0", 2, r"local.actors = '0' \(--actors\); allowed: a whole number from 1"),
+        (DEPLOY, "--minutes", 2, "--minutes needs a value"),
+        (DEPLOY, "--run a/b", 2, "run 'a/b' can't stand in a key"),
+        (DEPLOY, "--run latest", 2, "run 'latest' is the name of the newest run"),
+        (DEPLOY, "--resume", 2, "--resume needs --run NAME"),
+        (
+            DEPLOY,
+            "--run nobody --resume",
+            2,
+            "run 'nobody' can't be resumed: there is no runs/nobody/config.toml",
+        ),
+        (DEPLOY, "--config nowhere.toml", 2, "can't read nowhere.toml: No such file"),
+        (LEARNER, "--ppo.clipp 0.2", 2, r"unknown flag --ppo.clipp; did you mean '--ppo.clip'\?"),
+        (LEARNER, "--endpoint udp/here", 2, "learner.endpoint = 'udp/here'"),
+        (
+            LEARNER,
+            "--run nobody --resume",
+            1,
+            "nothing to resume in runs/nobody/checkpoints: no checkpoint there",
+        ),
+        (
+            ACTOR,
+            "--endpoint tcp/127.0.0.1:9 --connect-timeout-s 1",
+            1,
+            "no hub answered .* start the learner",
+        ),
+        (EVALUATOR, "--policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
+    ],
+)
+def test_a_mistake_ends_with_one_line_that_says_what_is_allowed(tmp_path, module, flags, status, line):
+    found = one_line(tmp_path, module, *flags.split())
+
+    assert found[0] == status
+    assert re.search(line, found[1]), found[1]
+
+
+def test_a_taken_port_of_the_learner_is_named(tmp_path):
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
+        alone = one_line(tmp_path, LEARNER, "--endpoint", endpoint)
+        whole = one_line(tmp_path, DEPLOY, "--run", "r", "--endpoint", endpoint, "--panel", "off")
+
+    for status, line in (alone, whole):
+        assert status == 1
+        assert f"can't listen at {endpoint}" in line
+        assert "Address already in use" in line
+
+
+def test_a_taken_port_of_the_metrics_is_named_before_anything_starts(tmp_path):
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        alone = one_line(tmp_path, ACTOR, "--metrics-port", port)
+        whole = one_line(tmp_path, DEPLOY, "--run", "r", "--metrics-port", port - 1)
+
+    assert alone[0] == 1
+    assert f"127.0.0.1:{port}" in alone[1]
+    assert whole[0] == 2
+    assert f"port {port} can't be had: Address already in use" in whole[1]
+    assert not (tmp_path / "runs" / "r").exists()
+
+
+def test_unreadable_files_are_named_with_what_is_wrong_in_them(tmp_path):
+    policy = tmp_path / "policy"
+    policy.mkdir()
+    (policy / "contract.json").write_text('{"format": 1}')
+    (policy / "weights.safetensors").write_bytes(b"rubbish")
+    checkpoints = tmp_path / "runs" / "r" / "checkpoints"
+    checkpoints.mkdir(parents=True)
+    (checkpoints / "00000001.safetensors").write_bytes(b"rubbish")
+
+    assert (
+        "contract.json: observation: Field required" in one_line(tmp_path, EVALUATOR, "--policy", policy)[1]
+    )
+    assert (
+        "checkpoint runs/r/checkpoints/00000001.safetensors is not readable"
+        in (one_line(tmp_path, LEARNER, "--run", "r", "--resume")[1])
+    )
+    assert "go on with --resume, or choose another --run" in one_line(tmp_path, LEARNER, "--run", "r")[1]
+
+
+def test_a_run_is_not_begun_again_by_accident(tmp_path):
+    (tmp_path / "runs" / "r").mkdir(parents=True)
+    (tmp_path / "runs" / "r" / "config.toml").write_text("")
+
+    status, line = one_line(tmp_path, DEPLOY, "--run", "r")
+    assert status == 2
+    assert "run 'r' exists already in runs/r: go on with --resume, or choose another --run" in line
+
+
+def test_an_actor_at_a_hub_without_a_learner_says_whom_it_waits_for_and_ends_when_asked(tmp_path):
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    hub = open_zenoh(ZenohConfig(mode="hub", endpoint=endpoint))
+    try:
+        flags = ("--endpoint", endpoint, "--envs", 4, "--silence-warning-s", 0.5)
+        with running(tmp_path, ACTOR, *flags) as actor:
+            wait_until(
+                lambda: (
+                    "waiting for='a policy from the learner on topspin/v1/default/policy'"
+                    in actor.err.read_text()
+                ),
+                60,
+                "the actor to name the learner",
+            )
+            actor.process.terminate()
+            status, _, err = actor.wait(20)
+    finally:
+        hub.close()
+
+    assert status == 0
+    assert "Traceback" not in err

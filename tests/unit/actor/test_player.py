@@ -1,0 +1,161 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from common.comms.messages import UNVALIDATED, PolicySnapshot
+from common.env.rally_env import EnvConfig, Launches
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import normalize
+from common.policy.weights import PolicyError, new_network, observation_moments, pack
+from common.rally.launch import draw_rallies
+from common.rally.observation import critic_layout, size
+from services.actor.player import Player
+
+ENVS, HORIZON = 6, 40
+NETWORK = NetworkConfig(units=(16, 8))
+OBSERVATION = EnvConfig().observation
+SIZE = size(critic_layout(OBSERVATION))
+CONFIG = EnvConfig(time_limit_s=0.5)  # some rallies end in time, some are cut
+
+
+class Dealer:
+    """Deals a generator's rallies, every third of them as if nobody had validated it."""
+
+    def __init__(self):
+        self.block = draw_rallies(400, seed=5)
+        self.dealt = 0
+
+    def take(self, count):
+        rows = np.arange(self.dealt, self.dealt + count)
+        self.dealt += count
+        return Launches(self.block.launches[rows], self.block.seeds[rows], rows % 3 > 0)
+
+
+def make_player(seed=1):
+    return Player(CONFIG, NETWORK, Dealer(), ENVS, HORIZON, seed)
+
+
+def make_snapshot(player, seed=2, **changes):
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    snapshot = PolicySnapshot(
+        run="r",
+        generation=4,
+        version=7,
+        stage_number=1,
+        stage=2,
+        epoch=7,
+        frames=1000,
+        contract_hash=player.contract_hash,
+        weights=pack(new_network(NETWORK, OBSERVATION)),
+        obs_mean=rng.normal(size=SIZE) * 0.1,
+        obs_var=rng.uniform(0.5, 2.0, SIZE),
+        obs_count=100,
+        value_mean=1.5,
+        value_var=4.0,
+    )
+    return dataclasses.replace(snapshot, **changes)
+
+
+def played(seed=1, sequence=3):
+    player = make_player(seed)
+    player.adopt(make_snapshot(player))
+    return player, player.play("a", 9, sequence)
+
+
+@pytest.fixture(scope="module")
+def block():
+    return played()[1]
+
+
+def test_a_block_says_who_played_it_and_by_what(block):
+    stamps = ("run", "generation", "version", "stage_number", "actor", "incarnation", "sequence")
+
+    assert [getattr(block, name) for name in stamps] == ["r", 4, 7, 1, "a", 9, 3]
+    assert block.obs.shape == (HORIZON, ENVS, SIZE)
+    assert block.fault() == ""
+
+
+def test_its_log_mu_and_values_are_those_of_the_policy_at_its_observations(block):
+    player = make_player()
+    snapshot = make_snapshot(player)
+    player.adopt(snapshot)
+    network = player._network
+    moments = observation_moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, OBSERVATION)
+    with torch.no_grad():
+        mean, value = network(torch.from_numpy(normalize(block.obs.reshape(-1, SIZE), moments)))
+        normal = torch.distributions.Normal(mean, network.log_sigma.exp())
+        log_mu = normal.log_prob(torch.from_numpy(block.actions.reshape(-1, 7))).sum(-1)
+
+    # float32 sums over 7 terms in another order
+    np.testing.assert_allclose(block.log_mu.reshape(-1), log_mu.numpy(), atol=2e-4)
+    np.testing.assert_allclose(block.values.reshape(-1), value.numpy() * 2.0 + 1.5, atol=1e-4)
+
+
+def test_a_cut_rally_keeps_its_real_last_observation_at_its_step(block):
+    cut = np.flatnonzero(block.truncated)
+
+    assert cut.size > 0
+    np.testing.assert_array_equal(block.final_index, cut)
+    assert block.final_obs.shape == (cut.size, SIZE)
+    following = np.concatenate((block.obs[1:], block.last_obs[None])).reshape(-1, SIZE)[cut]
+    # after the cut another rally begins: its first observation is not the last of this one
+    assert (np.abs(block.final_obs - following).max(axis=1) > 1e-3).all()
+    assert not (block.terminated & block.truncated).any()
+
+
+def test_episodes_and_flags_tell_of_every_rally_that_ended(block):
+    ended = int((block.terminated | block.truncated).sum())
+
+    assert len(block.episodes.outcome) >= ended > 0
+    assert block.rally_flags.max() == UNVALIDATED
+    assert 0 < block.episodes.unvalidated.sum() < len(block.episodes.outcome)
+    np.testing.assert_allclose(block.reward_terms.sum(), block.rewards.sum(dtype=np.float64), rtol=1e-4)
+
+
+def test_the_same_seed_and_number_play_the_same_block_bit_for_bit_and_others_another(block):
+    again, other_number, other_seed = played()[1], played(sequence=4)[1], played(seed=2)[1]
+
+    for field in dataclasses.fields(block):
+        if field.name not in ("seconds", "episodes"):
+            np.testing.assert_array_equal(getattr(block, field.name), getattr(again, field.name), field.name)
+    assert not np.array_equal(block.actions, other_number.actions)
+    assert not np.array_equal(block.actions, other_seed.actions)
+
+
+def test_the_next_block_goes_on_where_the_last_one_ended():
+    player, first = played()
+
+    second = player.play("a", 9, 4)
+
+    np.testing.assert_array_equal(second.obs[0], first.last_obs)
+
+
+def test_a_policy_of_another_task_or_with_unusable_weights_is_refused_and_the_old_one_kept():
+    player, _ = played()
+    before = {name: value.clone() for name, value in player._network.state_dict().items()}
+    nan = new_network(NETWORK, OBSERVATION)
+    with torch.no_grad():
+        next(nan.parameters()).fill_(float("nan"))
+
+    for changes, message in (
+        ({"contract_hash": "other"}, "start both with the same network, env and launch settings"),
+        ({"weights": b"rubbish"}, "not readable as safetensors"),
+        ({"weights": pack(nan)}, "are not finite"),
+        ({"weights": pack(new_network(NetworkConfig(units=(16, 9)), OBSERVATION))}, "have shape"),
+        ({"obs_mean": np.zeros(3), "obs_var": np.ones(3)}, r"shapes \(3,\)"),
+    ):
+        with pytest.raises(PolicyError, match=message):
+            player.adopt(make_snapshot(player, version=8, **changes))
+
+    assert player.snapshot is not None
+    assert player.snapshot.version == 7
+    for name, value in player._network.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def test_nothing_is_played_before_there_is_a_policy():
+    with pytest.raises(RuntimeError, match="there is no policy yet"):
+        make_player().play("a", 1, 0)

@@ -1,0 +1,148 @@
+import os
+import signal
+import time
+
+import pytest
+
+from common.process import BAD_CONFIG
+from deploy.child import Assignment
+from deploy.config import DeployConfig, service_sections
+from deploy.local import check_ports, metrics_ports, settings, specs
+from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
+
+CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
+
+
+def wait_until(condition, timeout_s=20.0):
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_pauses_before_restarts_double_up_to_a_bound():
+    pauses = [restart_pause(deaths) for deaths in range(1, 12)]
+
+    assert pauses[:3] == [RESTART_PAUSE_S, 2 * RESTART_PAUSE_S, 4 * RESTART_PAUSE_S]
+    assert pauses[-1] == RESTART_PAUSE_MAX_S
+    assert pauses == sorted(pauses)
+
+
+def flag(spec, name):
+    return spec.arguments[spec.arguments.index(name) + 1]
+
+
+def test_the_topology_is_one_learner_and_workers_that_come_back_each_with_a_port_of_its_own(tmp_path):
+    family = specs(CONFIG, tmp_path / "config.toml")
+
+    assert [spec.name for spec in family] == [
+        *("learner-0", "evaluator-0", "generator-0", "generator-1", "actor-0", "actor-1", "actor-2"),
+    ]
+    assert [spec.name for spec in family if not spec.restart] == ["learner-0"]
+    assert [int(flag(spec, "--metrics-port")) for spec in family] == list(range(9100, 9107))
+    assert metrics_ports(CONFIG) == list(range(9100, 9107))
+    assert [flag(spec, "--index") for spec in family if spec.role == "actor"] == ["0", "1", "2"]
+    assert set(metrics_ports(CONFIG.model_copy(update={"metrics_port": 0}))) == {0}
+
+
+def test_a_run_is_resumed_from_its_checkpoints_and_begun_anew_without_any(tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    resumed = CONFIG.model_copy(update={"resume": True})
+    assert "--resume" not in specs(resumed, tmp_path / "config.toml")[0].arguments
+
+    (tmp_path / "checkpoints" / "00000001.safetensors").touch()
+
+    assert "--resume" in specs(resumed, tmp_path / "config.toml")[0].arguments
+    assert "--resume" not in specs(CONFIG, tmp_path / "config.toml")[0].arguments
+
+
+def test_all_sections_agree_on_task_run_and_shards():
+    config = DeployConfig(actors=3, launch="strong", env={"noise": "hard", "flight": "full"})
+    sections = service_sections(config, "r", "tcp/127.0.0.1:1", "runs/r")
+
+    for name in ("run", "endpoint", "seed", "launch"):
+        assert len({str(section[name]) for section in sections.values()}) == 1, name
+    assert sections["learner"]["env"] == sections["actor"]["env"] == sections["evaluator"]["env"]
+    assert sections["learner"]["network"] == sections["actor"]["network"]
+    assert sections["generator"]["noise"] == "hard"
+    assert sections["generator"]["flight"] == "full"
+    assert sections["actor"]["shards"] == sections["generator"]["shards"] == 3
+
+
+def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_given_now(tmp_path, monkeypatch):
+    from deploy.local import prepare
+
+    monkeypatch.chdir(tmp_path)
+    first = settings(["--run", "r", "--actors", "5", "--network.units", "8,4", "--evaluator.rallies", "33"])
+    prepare(first)
+
+    again = settings(["--run", "r", "--resume", "--minutes", "3"])
+    newest = settings(["--run", "latest", "--resume"])
+
+    assert again == first.model_copy(update={"resume": True, "minutes": 3.0})
+    assert newest.run == "r"
+
+
+def test_a_free_port_passes_the_check():
+    check_ports(CONFIG.model_copy(update={"metrics_port": 0}))
+
+
+def test_an_assignment_survives_the_pipe():
+    assignment = Assignment("runs/r/logs/actor-0.log", ("--id", "0", "--config", "a\nb"))
+
+    line = assignment.to_line()
+
+    assert line.count(b"\n") == 1
+    assert Assignment.from_line(line) == assignment
+
+
+@pytest.fixture
+def service(tmp_path, monkeypatch):
+    """A module that logs a line and ends as it is told."""
+    (tmp_path / "stand_in.py").write_text(
+        "import sys, time\n"
+        "print('started', *sys.argv[1:], flush=True)\n"
+        "sys.exit(int(sys.argv[2])) if sys.argv[1] == 'end' else time.sleep(600)\n"
+    )
+    root = os.getcwd()
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{root}")
+    return "stand_in"
+
+
+def kept(tmp_path, *arguments, restart=True):
+    return Family([Spec("worker-0", "generator", arguments, restart)], tmp_path)
+
+
+def test_a_process_that_dies_is_started_again_and_its_log_goes_on(tmp_path, service):
+    family = kept(tmp_path, service, "stay")
+    child, log = family.children["worker-0"], tmp_path / "worker-0.log"
+    wait_until(lambda: "started" in log.read_text())
+    os.kill(child.process.pid, signal.SIGKILL)
+    wait_until(lambda: (family.watch(time.monotonic()), child.restarts == 1)[1])
+    wait_until(lambda: log.read_text().count("started stay") == 2)
+    alive = child.process.poll() is None
+    family.stop(["worker-0"], 5.0)
+
+    assert alive
+    assert child.exits == [-signal.SIGKILL]
+    assert child.process.poll() is not None
+
+
+def test_a_process_that_cannot_use_its_settings_is_not_started_again(tmp_path, service):
+    family = kept(tmp_path, service, "end", str(BAD_CONFIG))
+    wait_until(lambda: (family.watch(time.monotonic()), family.hopeless())[1] == "worker-0")
+    family.watch(time.monotonic() + 100.0)
+    family.stop(["worker-0"], 1.0)
+
+    assert family.children["worker-0"].restarts == 0
+    assert family.last_line("worker-0") == f"started end {BAD_CONFIG}"
+
+
+def test_a_process_ends_when_whoever_holds_its_pipe_does(tmp_path, service):
+    family = kept(tmp_path, service, "stay")
+    process = family.children["worker-0"].process
+    wait_until(lambda: "started" in (tmp_path / "worker-0.log").read_text())
+
+    process.stdin.close()
+
+    assert process.wait(20) == -signal.SIGTERM

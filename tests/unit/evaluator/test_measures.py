@@ -1,0 +1,88 @@
+import json
+
+import numpy as np
+import pytest
+
+from common.rally.trajectory import Outcome
+from services.evaluator.measures import Played, measures, wilson
+from services.evaluator.service import score
+
+
+def make_played(rows):
+    """Return rallies from (outcome, caught, over, landing error)."""
+    outcomes, caught, over, errors = zip(*rows, strict=True)
+    return Played(
+        seeds=np.arange(len(rows), dtype=np.uint64),
+        outcomes=np.array(outcomes, np.uint8),
+        landing_errors=np.array(errors, np.float32),
+        caught=np.array(caught),
+        over=np.array(over),
+        returns=np.zeros(len(rows), np.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (81, 263, 0.2553, 0.3662),  # Newcombe 1998, table I, method 3
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (29, 29, 0.8830, 1.0000),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_wilsons_intervals_are_the_published_ones(successes, trials, low, high):
+    np.testing.assert_allclose(wilson(successes, trials), (low, high), atol=5e-5)
+
+
+def test_rates_are_those_of_a_count_by_hand():
+    nan = float("nan")
+    found = measures(
+        make_played(
+            [
+                (Outcome.RETURNED, True, True, 0.1),
+                (Outcome.RETURNED, True, True, 0.25),
+                (Outcome.RETURNED, True, True, 0.7),
+                (Outcome.OUT, True, True, nan),
+                (Outcome.NET, True, False, nan),
+                *[(Outcome.MISS, False, False, nan)] * 5,
+            ]
+        )
+    )
+
+    assert found["rallies"] == 10
+    assert (found["catch_rate"], found["over_rate"], found["return_rate"]) == (0.5, 0.4, 0.3)
+    assert found["return_after_catch"] == 0.6
+    assert found["return_after_catch_ci"] == [round(bound, 4) for bound in wilson(3, 5)]
+    assert found["target_error_mean"] == 0.35
+    assert found["target_error_median"] == 0.25
+    # 0.35 +- 1.96 * 0.3122 / sqrt(3)
+    np.testing.assert_allclose(found["target_error_mean_ci"], (-0.0033, 0.7033), atol=1e-4)
+    assert (found["within_0.2_m"], found["within_0.3_m"]) == (0.3333, 0.6667)
+    assert found["outcomes"] == {"returned": 3, "out": 1, "net": 1, "miss": 5}
+
+
+def test_rates_without_trials_are_nothing_and_the_line_is_still_json():
+    found = measures(make_played([(Outcome.MISS, False, False, float("nan"))]))
+
+    assert found["catch_rate"] == 0.0
+    assert found["return_after_catch"] is None
+    assert found["target_error_mean"] is None
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_best_is_a_later_stage_then_its_rate_then_the_landing_error():
+    def found(catch, back, error):
+        return {"catch_rate": catch, "return_rate": back, "target_error_mean": error}
+
+    ranking = [
+        score(1, found(0.2, 0.0, None)),
+        score(1, found(0.9, 0.0, None)),
+        score(3, found(0.5, 0.1, 0.4)),
+        score(3, found(0.4, 0.3, None)),
+        score(3, found(0.4, 0.3, 0.5)),
+        score(3, found(0.4, 0.3, 0.4)),
+    ]
+
+    assert ranking == sorted(ranking)
