@@ -177,13 +177,20 @@ def test_workers_refuse_what_they_cannot_use_and_play_on(tmp_path):
                 )
         publish(KEYS.stage(), b"nonsense", Flow.STAGE)
         publish(KEYS.stage(), encode(StageChange("test", 1, 50, 3, 0, 0, "a lie")), Flow.STAGE)
-        publish(KEYS.rally(0), b"nonsense", Flow.RALLY)
-        publish(KEYS.rally(0), encode(wild_rallies()), Flow.RALLY)
         for role in ("actor", "evaluator", "generator"):
             assert request(KEYS.ctl(role, "0"), b"nonsense", 5.0, Flow.CONTROL).wait() is NoReply.NO_SERVER
         request(KEYS.rally(0), b"nonsense", 5.0, Flow.RALLY).wait()
         wait_until(lambda: refused(actor, "stage") == 1, 10, "the actor to refuse a stage")
-        wait_until(lambda: refused(actor, "rally") >= 1, 30, "the actor to refuse rallies")
+        for payload in (b"nonsense", encode(wild_rallies())):  # sent until seen: newer batches push it out
+            seen = refused(actor, "rally")
+            wait_until(
+                lambda n=seen, p=payload: (
+                    publish(KEYS.rally(0), p, Flow.RALLY),
+                    refused(actor, "rally") > n,
+                )[1],
+                30,
+                "the actor to refuse rallies",
+            )
         epoch, evaluations = learner.service.training.progress.epoch, evaluator.service.evaluations
         wait_until(lambda: learner.service.training.progress.epoch > epoch + 3, 30, "more training")
         wait_until(lambda: evaluator.service.evaluations > evaluations, 30, "another evaluation")

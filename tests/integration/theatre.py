@@ -176,6 +176,11 @@ def stage(folder, **learner):
     theatre = Stage(folder, **learner)
     try:
         yield theatre
+    except BaseException as error:
+        for entry in theatre.running:
+            if entry.error is not None:
+                error.add_note(f"{type(entry.service).__name__} had failed: {entry.error!r}")
+        raise
     finally:
         for transport in theatre.peers:
             transport.close()
