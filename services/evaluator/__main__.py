@@ -8,10 +8,9 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from common.comms.zenoh_transport import open_zenoh
 from common.config import load
+from common.connection import connected
 from common.log import set_up_logging
-from common.metrics import Metrics
 from common.policy.weights import load_policy
 from common.process import DONE, run_service
 from common.service_config import new_incarnation
@@ -26,21 +25,13 @@ PROG = "python -m services.evaluator"
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
     config = load(EvaluatorConfig, sys.argv[1:], prog=PROG, section="evaluator")
-    set_up_logging(config.log_level, f"evaluator/{config.id}")
     if config.policy:
+        set_up_logging(config.log_level, "evaluator")
         play_once(config)
         return DONE
     os.nice(config.niceness)
-    metrics = Metrics("evaluator", config.id)
-    metrics.serve(config.metrics_port, config.metrics_host)
-    try:
-        transport = open_zenoh(config, stop)
-        try:
-            EvaluatorService(config, transport, metrics, new_incarnation()).run(stop)
-        finally:
-            transport.close()
-    finally:
-        metrics.close()
+    with connected("evaluator", config, stop) as (transport, metrics):
+        EvaluatorService(config, transport, metrics, new_incarnation()).run(stop)
     return DONE
 
 

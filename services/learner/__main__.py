@@ -3,10 +3,8 @@
 import sys
 from threading import Event
 
-from common.comms.zenoh_transport import open_zenoh
 from common.config import load
-from common.log import set_up_logging
-from common.metrics import Metrics
+from common.connection import connected
 from common.process import DONE, run_service
 from services.learner.config import LearnerConfig
 from services.learner.service import LearnerService
@@ -17,17 +15,8 @@ PROG = "python -m services.learner"
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
     config = load(LearnerConfig, sys.argv[1:], prog=PROG, section="learner")
-    set_up_logging(config.log_level, f"learner/{config.id}")
-    metrics = Metrics("learner", config.id)
-    metrics.serve(config.metrics_port, config.metrics_host)
-    try:
-        transport = open_zenoh(config, stop)
-        try:
-            LearnerService(config, transport, metrics).run(stop)
-        finally:
-            transport.close()
-    finally:
-        metrics.close()
+    with connected("learner", config, stop) as (transport, metrics):
+        LearnerService(config, transport, metrics).run(stop)
     return DONE
 
 
