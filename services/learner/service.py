@@ -126,7 +126,6 @@ class LearnerService:
         self._token = transport.declare_alive(keys.alive("learner", LEARNER_ID, self._generation))
         self._paused = self._stopping = False
         self._warned = False
-        self._frames_before = self.training.progress.frames
         self._blob = b""
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         self.state = "waiting"

@@ -4,7 +4,6 @@ import dataclasses
 
 import msgpack
 import numpy as np
-from theatre import CURRICULUM, stage, wait_until
 
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
@@ -13,6 +12,7 @@ from common.comms.transport import Flow, NoReply
 from common.env.rally_env import EnvConfig
 from common.policy.weights import load_tensors, save_tensors
 from common.rally.observation import PAPER_OBSERVATION
+from tests.integration.theatre import CURRICULUM, stage, wait_until
 from tests.unit.comms.test_codec import sealed
 from tests.unit.learner.rollouts import make_rollout
 

@@ -6,7 +6,6 @@ import threading
 import numpy as np
 import pytest
 import torch
-from theatre import CURRICULUM, free_endpoint, stage, wait_until
 
 from common.comms.messages import VerdictKind
 from common.comms.transport import TransportError
@@ -16,6 +15,7 @@ from common.policy.weights import load_policy
 from services.actor.service import NoRalliesError
 from services.learner.intake import IntakeConfig
 from services.learner.service import RunExistsError
+from tests.integration.theatre import CURRICULUM, free_endpoint, stage, wait_until
 
 LONG = CURRICULUM.model_copy(update={"stage_3": 500})
 SYNCHRONOUS = {"intake": IntakeConfig(dataset_rollouts=2, max_lag=0)}

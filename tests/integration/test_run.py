@@ -3,9 +3,8 @@
 import csv
 import json
 
-from theatre import stage, wait_until
-
 from common.policy.weights import load_policy
+from tests.integration.theatre import stage, wait_until
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 

@@ -4,10 +4,10 @@ import re
 import socket
 
 import pytest
-from commands import run, running, wait_until
 
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
+from tests.system.commands import run, running, wait_until
 
 DEPLOY, LEARNER, ACTOR, EVALUATOR = (
     "deploy.local",

@@ -7,9 +7,9 @@ import signal
 import time
 
 import pytest
-from commands import STAGES, TINY, children_of, last_json, run, running, wait_until
 
 from common.policy.weights import load_policy
+from tests.system.commands import STAGES, TINY, children_of, last_json, run, running, wait_until
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 MEASURES = ("catch_rate", "over_rate", "return_rate", "return_after_catch")
