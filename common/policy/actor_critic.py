@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from common.policy.d2rl import D2RL
-from common.policy.normalizer import EPSILON, Moments
+from common.policy.normalizer import Moments, scale_of
 
 JUDGE_UNITS = (128, 64)  # hidden layers between trunk, truth and value of a privileged critic
 LOG_2_PI = math.log(2.0 * math.pi)
@@ -81,10 +81,11 @@ class ActorCritic(nn.Module):
         """Let the network, fed by ``new`` moments, do just what it did fed by ``old`` ones (but for the clip).
 
         W (x - m)/s + b = W' (x - m')/s' + b' with W' = W s'/s and b' = b + W (m' - m)/s, wherever x enters. It is
-        what Pop-Art (van Hasselt et al. 2016) does for a value's scale, done at the inputs.
+        what Pop-Art (van Hasselt et al. 2016) does for a value's scale, done at the inputs. An input that both moments
+        clip enters as 5 before and after, and its weight still grows by s'/s: the scale's floor bounds that.
         """
-        scale = np.sqrt((new.var + EPSILON) / (old.var + EPSILON))
-        shift = (new.mean - old.mean) / np.sqrt(old.var + EPSILON)
+        scale = scale_of(new) / scale_of(old)
+        shift = (new.mean - old.mean) / scale_of(old)
         trunks = [trunk for trunk in (self.trunk, self.critic_trunk) if trunk is not None]
         fed: list[tuple[nn.Module, int]] = [
             (layer, self.obs_size) for trunk in trunks for layer in trunk.layers

@@ -10,6 +10,7 @@ Floats = npt.NDArray[np.float32]
 
 CLIP = 5.0  # normalised values are clipped to +-5 (rl_games, and the paper's weights)
 EPSILON = 1e-5  # added to the variance
+SMALLEST_VARIANCE = 0.01  # a flag that is almost never up must not be blown up into the clip when it is
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +46,14 @@ class Moments:
         return Moments(self.mean, self.var, 1)
 
 
+def scale_of(moments: Moments) -> Array:
+    """Return what deviations from the mean are divided by (D,): sqrt(var + 1e-5), with a floor of 0.1."""
+    scale: Array = np.sqrt(np.maximum(moments.var, SMALLEST_VARIANCE) + EPSILON)
+    return scale
+
+
 def normalize(data: Floats, moments: Moments) -> Floats:
-    """Return (data - mean) / sqrt(var + 1e-5), clipped to +-5, float32, for ``data`` (..., D)."""
-    scale = (1.0 / np.sqrt(moments.var + EPSILON)).astype(np.float32)
+    """Return (data - mean) / scale_of(moments), clipped to +-5, float32, for ``data`` (..., D)."""
+    scale = (1.0 / scale_of(moments)).astype(np.float32)
     result = (data - moments.mean.astype(np.float32)) * scale
     return np.clip(result, -CLIP, CLIP, out=result)

@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -119,3 +121,26 @@ def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, 
 
     torch.testing.assert_close(after, before, atol=2e-5, rtol=1e-4)
     assert (changed[1] - before[1]).abs().max() > 0.01
+
+
+def test_a_flag_that_becomes_common_does_not_throw_the_policy_over():
+    """Its variance rises a thousandfold, and where it is up both normalised values are near the clip."""
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 16)))
+    torch.nn.init.orthogonal_(network.mean.weight, 0.3)
+    raw = np.zeros((1, 37), np.float32)
+    raw[0, 36] = 1.0
+    mean, var = np.zeros(37), np.ones(37)
+
+    def share(p):
+        m, v = mean.copy(), var.copy()
+        m[36], v[36] = p, p * (1 - p)
+        return Moments(m, v, 1)
+
+    with torch.no_grad():
+        before = network.act(torch.from_numpy(normalize(raw, share(1e-5))))
+        for old, new in pairwise((1e-5, 1e-4, 1e-3, 0.01, 0.02)):
+            network.renormalize(share(old), share(new))
+        after = network.act(torch.from_numpy(normalize(raw, share(0.02))))
+
+    assert (after - before).abs().max() < 0.5 * before.abs().max()
