@@ -23,8 +23,8 @@ $(STAMP): pyproject.toml
 train: $(STAMP)           ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
 	$(BIN)/python -m deploy.local --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
 
-play: $(STAMP)            ## measure the newest run's policy on fresh rallies
-	$(BIN)/python -m services.evaluator --policy runs/latest/policy/latest --rallies 1000 --json
+play: $(STAMP)            ## measure the newest run's policy on rallies that its own evaluator does not play
+	$(BIN)/python -m services.evaluator --policy runs/latest/policy/latest --rallies 1000 --seed 1 --json
 
 test: $(STAMP)            ## all tests
 	$(BIN)/python -m pytest

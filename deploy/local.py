@@ -74,7 +74,7 @@ def specs(config: DeployConfig, config_file: Path) -> list[Spec]:
 
     ports = iter(metrics_ports(config))
     # A run that was stopped before its first checkpoint begins anew.
-    resumes = config.resume and any((config_file.parent / "checkpoints").iterdir())
+    resumes = config.resume and any((config_file.parent / "checkpoints").glob("*.safetensors"))
     family = [service("learner", 0, *(("--resume",) if resumes else ()))]
     if config.evaluate:
         family.append(service("evaluator", 0))

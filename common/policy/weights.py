@@ -159,7 +159,8 @@ class Policy:
 def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
     """Write a policy folder; whoever reads it sees the old one or the new one, never a mixture.
 
-    The folder is a symbolic link that is replaced in one step; the folders of older policies go.
+    The folder is a symbolic link that is replaced in one step. The folder before stays until the next save, for those
+    who are reading it; older ones go.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
@@ -169,12 +170,16 @@ def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: 
     tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
     (fresh / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
     (fresh / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+    for path in fresh.iterdir():
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
     old = folder.parent / os.readlink(folder) if folder.is_symlink() else None
     link = folder.parent / f"{fresh.name}.link"
     link.symlink_to(fresh.name)
     os.replace(link, folder)
-    if old is not None:
-        shutil.rmtree(old, ignore_errors=True)
+    for other in folder.parent.glob(f".{folder.name}-*"):
+        if other not in (fresh, old):
+            shutil.rmtree(other, ignore_errors=True)
 
 
 def load_policy(folder: Path) -> Policy:

@@ -79,7 +79,7 @@ class Rules(NamedTuple):
     transitions: Integers  # trajectory.transition_table()
     rewards: Array  # (8, 5) reward.reward_table()[stage - 1]
     landing_scale: float  # [m]
-    rate_scale: float  # reference rate / control rate: continuous rows and e_r are rates
+    rate_scale: float  # reference rate / control rate: continuous rows, torque and collision are rates (jitter is not)
     torque_weight: float
     torque_limit: Array  # (7,) [N, Nm]
     jitter_weight: float

@@ -47,7 +47,7 @@ class RewardConfig(BaseModel):
         50.0,
         gt=0,
         le=1000,
-        description="rate at which continuous rows and e_r are paid unscaled",
+        description="rate at which continuous rows, torque and collision are paid unscaled",
         json_schema_extra={"unit": "Hz"},
     )
     torque: float = Field(

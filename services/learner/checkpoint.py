@@ -67,6 +67,8 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
+    for stale in folder.glob("*.part"):  # of a life that ended within a save
+        stale.unlink(missing_ok=True)
     for old in checkpoints(folder)[:-KEPT]:
         old.unlink(missing_ok=True)
     return path

@@ -81,7 +81,7 @@ class UpdateStats:
     value_loss: float
     bound_loss: float
     entropy: float
-    kl: float  # KL(prox, new) after the update
+    kl: float  # KL(prox, new), mean over the last pass: it steers the learning rate
     clip_fraction: float
     weight: float  # mean of pi_prox/mu before clipping: 1 at lag 0
     gradient_norm: float  # before clipping

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from common.env.rally_env import EnvConfig
+from common.env.rally_env import EnvConfig, RallyEnv
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
 from common.policy.weights import ACTION_CONTRACT, Contract, Policy, new_network, observation_contract
@@ -89,3 +89,24 @@ def test_a_match_can_be_broken_off_between_two_steps():
 
     with pytest.raises(InterruptedError):
         play_match(make_policy(), evaluation_rallies(5, "paper", "off", seed=4), EnvConfig(), breathe=breathe)
+
+
+@pytest.mark.timeout(60)
+def test_a_fault_of_the_simulation_costs_one_rally_and_the_match_still_ends(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log file of its warnings
+    policy, rallies = make_policy(), evaluation_rallies(6, "paper", "standard", 0)
+    broken = []
+    start = RallyEnv.reset
+
+    def reset_and_break(env):
+        obs = start(env)
+        env.robot.joint_vel[1] = np.nan
+        broken.append(env)
+        return obs
+
+    monkeypatch.setattr(RallyEnv, "reset", reset_and_break)
+    played = play_match(policy, rallies, EnvConfig(), envs=3)
+
+    assert len(broken) == 1
+    assert len(played.seeds) == 5
+    assert set(played.seeds) < set(rallies.seeds)
