@@ -20,7 +20,7 @@ RobotPreset = Literal["rails", "usst"]
 
 MODEL_PATH = Path(__file__).with_name("robot.xml")
 MUJOCO_STEP = 0.004  # [s] racket pose against 0.25 ms: tests/unit/env/test_robot.py states the error
-MUJOCO_STEP_200_HZ = 0.0025  # [s] two substeps where the control period is 5 ms
+MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: 200 Hz, 100 Hz
 JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
 RACKET_BODY = "racket"
 MAX_ACTION_LATENCY = 0.020  # [s] how far back targets are kept: the latest of any noise profile

@@ -43,7 +43,7 @@ PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
         # Conti et al. 2026): their quantiles at LEVELS
         "match": Preset(
             position=(
-                # the last 3.43 is cut: a ball beyond 2.9 m counts as out of play
+                # the last quantile, 3.43, is cut to 2.80
                 (0.45, 0.98, 1.32, 1.59, 1.97, 2.62, 2.80),
                 (-0.79, -0.64, -0.29, -0.04, 0.31, 0.65, 0.83),
                 (-0.09, 0.07, 0.17, 0.21, 0.26, 0.34, 0.47),

@@ -8,8 +8,6 @@ from typing import Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.rally.trajectory import State
-
 
 class Part(NamedTuple):
     """A contiguous part of a vector."""
@@ -117,11 +115,7 @@ def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
     return policy_layout(config) + (PRIVILEGED if config.critic == "privileged" else ())
 
 
-OBSERVATION_SIZE = size(OBSERVATION)
 ACTION_SIZE = size(ACTION)
-
-CONTINUING = (State.TAU_01, State.TAU_12, State.TAU_23, State.TAU_30)
-"""The one-hot's order; an instant state shows as the one it continues as."""
 
 
 def markdown() -> str:
