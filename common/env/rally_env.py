@@ -54,6 +54,12 @@ class EnvConfig(BaseModel):
     go_on: float = Field(
         0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally"
     )
+    foresee: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of episodes that end once the ball is hit: its flight home is computed and paid at once",
+    )
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     reset_spread: float = Field(
         0.1,
@@ -89,7 +95,8 @@ class FinishedRallies:
     rows: Rows  # (n,) which environment
     seeds: npt.NDArray[np.uint64]  # (n,)
     outcomes: npt.NDArray[np.uint8]  # (n,) trajectory.Outcome
-    landing_errors: Floats  # (n,) [m], nan where nothing landed
+    landings: Floats  # (n, 2) [m] where on the opponent's court; nan where nothing landed
+    landing_errors: Floats  # (n,) [m] their distance to the target
     caught: Flags  # (n,)
     over: Flags  # (n,)
     validated: Flags  # (n,)
@@ -120,22 +127,25 @@ def _draw_robot(
     spread: float,
     gains: Array,
     offset: Array,
-) -> tuple[Flags, Array]:
+) -> tuple[Flags, Array, Array]:
     """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds.
 
     Returns:
-        Which robots stay as they are (n,); a number in [0, 1) that decides on going on over a return (n,).
+        Which robots stay as they are (n,); numbers in [0, 1) that decide on going on over a return (n,) and on
+        ending with the hit (n,).
     """
-    stay, go_on = np.empty(seeds.shape[0], np.bool_), np.empty(seeds.shape[0])
+    count = seeds.shape[0]
+    stay, go_on, ends = np.empty(count, np.bool_), np.empty(count), np.empty(count)
     low, high = noise.gain_factor
     for k in range(seeds.shape[0]):
         stay[k] = uniform(seeds[k], _RESET, 0) < carry_over
         go_on[k] = uniform(seeds[k], _RESET, 1)
+        ends[k] = uniform(seeds[k], _RESET, 2 + offset.shape[1])
         for j in range(7):
             offset[k, j] = between(-spread, spread, seeds[k], _RESET, 2 + j)
             for g in range(3):
                 gains[k, g, j] = between(low, high, seeds[k], _GAINS, 7 * g + j)
-    return stay, go_on
+    return stay, go_on, ends
 
 
 class RallyEnv:
@@ -272,6 +282,7 @@ class RallyEnv:
             rows=rows,
             seeds=r.seed[rows],
             outcomes=self._step.outcome[rows].astype(np.uint8),
+            landings=r.landing[rows].astype(np.float32),
             landing_errors=r.landing_error[rows].astype(np.float32),
             caught=r.caught[rows],
             over=r.over[rows],
@@ -290,7 +301,7 @@ class RallyEnv:
         self._lengths[rows] = 0
         gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
         config = self.config
-        stay, go_on = _draw_robot(
+        stay, go_on, ends = _draw_robot(
             launches.seeds, self.noise, config.carry_over, config.reset_spread, gains, offset
         )
         self.robot.set_gains(rows, gains, self._rallies.condition[rows, Condition.ACTION_LATENCY])
@@ -300,5 +311,7 @@ class RallyEnv:
             self.robot.go_home(home, offset[leaves])
             self._rallies.last_action[home] = self.robot.home_action
         rounds = np.where(config.rounds > 1, config.rounds, 1 + (go_on < config.go_on))
-        self._rallies.rounds_left[rows] = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)
+        left = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)
+        self._rallies.rounds_left[rows] = left
+        self._rallies.foreseen[rows] = (left == 1) & (ends < config.foresee)
         self._collision.launch(self._rallies, rows)

@@ -37,6 +37,7 @@ SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0
 CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
+_LONGEST_FLIGHT = 3.0  # [s] of a ball that was hit, to the floor at the latest
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -53,9 +54,11 @@ class Rallies(NamedTuple):
     condition: Array  # (B, 14) noise.Condition
     clock: Integers  # (B,) grid steps since launch
     rounds_left: Integers  # (B,) rallies left in this episode, the one in play included
+    foreseen: npt.NDArray[np.bool_]  # (B,) once hit, the ball's flight is flown to its end at once, robot apart
     caught: npt.NDArray[np.bool_]  # (B,) the racket touched the ball legally
     over: npt.NDArray[np.bool_]  # (B,) and it crossed the net after that
-    landing_error: Array  # (B,) [m] planar distance to the target; nan before a legal landing
+    landing: Array  # (B, 2) [m] where the ball landed; nan before a legal landing
+    landing_error: Array  # (B,) [m] planar distance of that to the target
     camera: Array  # (B, RING, 7) true samples on the grid, newest at ``head``
     head: Integers  # (B,)
     seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
@@ -121,8 +124,10 @@ def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
         condition=np.zeros((count, CONDITIONS)),
         clock=np.zeros(count, np.int64),
         rounds_left=np.ones(count, np.int64),
+        foreseen=np.zeros(count, np.bool_),
         caught=np.zeros(count, np.bool_),
         over=np.zeros(count, np.bool_),
+        landing=np.full((count, 2), np.nan),
         landing_error=np.full(count, np.nan),
         camera=np.zeros((count, RING, SAMPLE)),
         head=np.zeros(count, np.int64),
@@ -185,6 +190,7 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
     rallies.clock[b] = 0
     rallies.caught[b] = False
     rallies.over[b] = False
+    rallies.landing[b, 0], rallies.landing[b, 1] = np.nan, np.nan
     rallies.landing_error[b] = np.nan
     rallies.head[b] = 0
     for row in range(RING):
@@ -216,6 +222,7 @@ def judge(rallies: Rallies, b: int, state: int, what: int, pos: Vec, rules: Rule
         rallies.caught[b] = True
     elif following == _TAU_3:
         rallies.over[b] = True
+        rallies.landing[b, 0], rallies.landing[b, 1] = pos[0], pos[1]
         dx, dy = pos[0] - rallies.condition[b, 8], pos[1] - rallies.condition[b, 9]
         rallies.landing_error[b] = np.sqrt(dx * dx + dy * dy)
         if rallies.rounds_left[b] <= 1:
@@ -323,6 +330,48 @@ def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array
 
 
 @kernel
+def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Array) -> tuple[Flown, float]:
+    """Fly a ball that was hit to the rally's end at once, as if the robot were not there.
+
+    Nothing that the robot does now changes where the ball lands (but for touching it again), so a training rally
+    may end here: its frames are spent before the contact, and the landing is paid right behind it.
+
+    Returns:
+        Where the ball comes to, and the sum of ``aim`` over the control steps until then.
+    """
+    condition = rallies.condition[b]
+    pos, vel, spin, state, outcome, _, _, landed, _ = flown
+    target = (condition[8], condition[9], BALL_RADIUS)
+    aim, steps = 0.0, 0
+    while outcome == 0:
+        pos, vel, _, what, _ = fly_step(
+            pos,
+            vel,
+            spin,
+            GRID_STEP,
+            condition[0],
+            condition[1],
+            rules.flight_model,
+            no_robot,
+            0.0,
+            1.0,
+            0.0,
+        )
+        if pos[0] > BALL_RADIUS:
+            rallies.over[b] = True
+        if what != NONE:
+            state, outcome = judge(rallies, b, state, what, pos, rules)
+            landed = landed or state == _TAU_3
+        steps += 1
+        if outcome == 0 and steps % rules.grid_steps == 0:
+            near = norm(sub(pos, target))
+            aim += 1.0 / ((1.0 + near * near) * (1.0 + near * near))
+        if steps * GRID_STEP > _LONGEST_FLIGHT:
+            outcome = _TIME_OUT
+    return Flown(pos, vel, spin, state, outcome, False, False, landed, 0.0), aim
+
+
+@kernel
 def settle(
     rallies: Rallies,
     b: int,
@@ -340,6 +389,9 @@ def settle(
     """
     substeps = motion.joint_pos.shape[1]
     ball, condition = rallies.ball[b], rallies.condition[b]
+    later_aim = 0.0
+    if rallies.foreseen[b] and flown.state == _TAU_23 and flown.outcome == 0:
+        flown, later_aim = foresee(rallies, b, flown, rules, path[:0])
     pos, vel, spin, state, outcome, bounced, hit, landed, racket_speed = flown
     target = (condition[8], condition[9], BALL_RADIUS)
     joints = joints_at(path, substeps * motion.step, motion.step)
@@ -360,6 +412,7 @@ def settle(
     if not (bounced or hit or landed or state == _TAU_0):
         terms[0] = rules.rate_scale * rows[state, 1] * g
         terms[3] = rules.rate_scale * rows[state, 3] * aim
+    terms[3] += rules.rate_scale * rows[_TAU_23, 3] * later_aim
     torque, jitter, collision = 0.0, 0.0, 0.0
     for j in range(7):
         change = actions[b, j] - rallies.last_action[b, j]
