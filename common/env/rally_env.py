@@ -34,7 +34,7 @@ class EnvConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     robot: RobotPreset = Field("rails", description="robot: ours, or the same slowed to the authors' limits")
-    control_rate_hz: Literal[50, 100, 200] = Field(
+    control_rate_hz: Literal[25, 50, 100, 200] = Field(
         50, description="control steps a second", json_schema_extra={"unit": "Hz"}
     )
     noise: Literal["off", "standard", "hard"] = Field(

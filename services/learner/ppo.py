@@ -12,6 +12,7 @@ At lag 0 pi_prox = mu, w = 1: plain PPO.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +52,9 @@ class PPOConfig(BaseModel):
     target_kl: float = Field(
         0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to"
     )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32", description="of the update's matrix products; weights, losses and Adam are float32 always"
+    )
     refit_epochs: int = Field(
         24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
     )
@@ -88,6 +92,11 @@ class UpdateStats:
     explained_variance: float
     learning_rate: float
     finite: bool  # False: a gradient step was skipped because it was not finite
+
+
+def arithmetic(precision: str) -> torch.autocast:
+    """Return the context in which the network's products are computed in ``precision``."""
+    return torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16")
 
 
 def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
@@ -166,7 +175,9 @@ def update(
         for rows in torch.split(torch.randperm(count, generator=generator), config.minibatch):
             if len(rows) < min(config.minibatch, count) // 2:
                 continue  # a small remainder would weigh as much as a full batch
-            mean, values = network(data.obs[rows])
+            with arithmetic(config.precision):
+                mean, values = network(data.obs[rows])
+            mean, values = mean.float(), values.float()
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
             if hold_policy:
                 loss_policy = torch.zeros(())

@@ -15,7 +15,15 @@ from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, criti
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
 from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
-from services.learner.ppo import Dataset, PPOConfig, UpdateStats, denormalized, explained_variance, update
+from services.learner.ppo import (
+    Dataset,
+    PPOConfig,
+    UpdateStats,
+    arithmetic,
+    denormalized,
+    explained_variance,
+    update,
+)
 
 Floats = npt.NDArray[np.float32]
 
@@ -219,7 +227,9 @@ class Training:
                 steps, count = r.rewards.shape
                 obs = torch.from_numpy(normalize(r.obs, self.obs_moments).reshape(-1, self.obs_size))
                 actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
-                mean, value = self.network(obs)
+                with arithmetic(ppo.precision):
+                    mean, value = self.network(obs)
+                mean, value = mean.float(), value.float()
                 values = denormalized(value, self.value_moments).reshape(steps, count)
                 final = np.zeros(steps * count, np.float32)
                 final[r.final_index] = self._values(r.final_obs)
@@ -268,5 +278,6 @@ class Training:
     def _values(self, obs: Floats) -> Floats:
         if len(obs) == 0:
             return np.zeros(0, np.float32)
-        _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
-        return denormalized(value, self.value_moments)
+        with arithmetic(self.ppo.precision):
+            _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
+        return denormalized(value.float(), self.value_moments)
