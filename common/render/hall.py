@@ -75,7 +75,6 @@ _ALONG: Final = (0.70710678, 0.0, 0.70710678, 0.0)  # from z to x
 _LINE, _THIN = 0.010, 0.0006  # [m] half width of a line; how far it stands proud, or it would flicker
 _L, _W = TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 _GANTRY_Y, _RAIL_FROM, _RAIL_TO = 1.16, -2.40, -0.55  # [m] the rails that the beam runs on
-_LEG_Z, _LEG_HALF = (FLOOR_Z + 0.02) / 2, -(FLOOR_Z + 0.02) / 2
 
 
 def _box(body: str, finish: str, pos: Triple, half: Triple) -> tuple[str, str, int, Triple, Triple, None]:
@@ -90,7 +89,6 @@ def _disc(
 
 _UPRIGHT: Final = (1.0, 0.0, 0.0, 0.0)
 _R, _H = RACKET_RADIUS, RACKET_HALF_THICKNESS
-_LEG_FOOT: Final = 0.03
 
 # Body, finish, shape, place and half sizes [m] in the body's frame, turn
 PARTS: Final = (

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from common.rally.trajectory import Outcome
 from common.render.gl import Image, wanted
-from common.render.scene import TRAIL
+from common.render.scene import SPIN_RGB, TRAIL
 
 Rgb = tuple[float, float, float]
 
@@ -123,6 +123,7 @@ class Lettering:
     def _legend(self, draw: Any, margin: int, bottom: int) -> None:
         pad, gap, bar = self._px(_PAD), self._px(26), self._px(26)
         labels = [(rgb8(colour.rgb), colour.label) for colour in TRAIL.values()]
+        labels.append((rgb8(SPIN_RGB), "axis of spin"))
         wide = sum(bar + self._px(8) + draw.textlength(label, self._small) for _, label in labels)
         wide += gap * (len(labels) - 1)
         high = self._px(36)

@@ -36,6 +36,7 @@ TARGET_RGB: Final = (0.0, 0.72, 0.52)
 
 _TRAIL_RADIUS = 0.0075  # [m]
 _TARGET_RADIUS = 0.10  # [m]
+_CASTS_NO_SHADOW = mujoco.mjtCatBit.mjCAT_DECOR.value
 _OUT_OF_SIGHT = -50.0  # [m] far below the floor
 _FAINTEST = 0.16  # [-] opacity of the first ghost
 _STRIDE = 3  # grid steps a piece of the trail
@@ -105,6 +106,9 @@ class Painter:
         eye.lookat[:] = camera.look_at
         eye.distance, eye.azimuth, eye.elevation = camera.distance, camera.azimuth_deg, camera.elevation_deg
         mujoco.mjv_updateScene(model, data, self._options, None, eye, mujoco.mjtCatBit.mjCAT_ALL.value, scene)
+        for geom in scene.geoms[: scene.ngeom]:
+            if geom.type == mujoco.mjtGeom.mjGEOM_PLANE.value:
+                geom.category = _CASTS_NO_SHADOW  # the floor would, on itself, in patches
         for k, joints in enumerate(moment.ghosts):
             self._add_ghost(joints, _FAINTEST + 0.12 * k)
         self._add_target(moment.target)
@@ -159,7 +163,7 @@ class Painter:
             scene,
         )
         for geom in scene.geoms[first : scene.ngeom]:
-            geom.category = mujoco.mjtCatBit.mjCAT_DECOR.value  # casts no shadow
+            geom.category = _CASTS_NO_SHADOW
             geom.rgba[3] *= opacity
             if self._model.geom_bodyid[geom.objid] < self._arm:
                 geom.pos[2] = _OUT_OF_SIGHT  # a scene can only grow

@@ -4,7 +4,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from threading import Event
 from typing import Any, Final, Literal
@@ -13,11 +13,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.config import load
 from common.env.rally_env import EnvConfig
+from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import Contract, Policy, load_policy
 from common.process import DONE
 from common.rally.launch import RallyBlock
 from common.render.film import FilmOptions, check_tools, picture_count, pictures, write_film
+from common.render.gl import Image
 from common.render.rally_recorder import record
 from common.run_folder import LATEST, RunFolder
 from services.evaluator.match import evaluation_rallies, play_match
@@ -27,6 +29,10 @@ log = logging.getLogger(__name__)
 
 PROG: Final = "python -m services.evaluator play"
 SHIPPED_POLICY: Final = Path("assets/policies/default")
+
+
+class StoppedError(ReportedError):
+    """Somebody asked the command to stop before it was done."""
 
 
 class PlayConfig(BaseModel):
@@ -71,6 +77,11 @@ class PlayConfig(BaseModel):
 
 def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and film; return the exit status."""
+
+    def breathe() -> None:
+        if stop.is_set():
+            raise StoppedError("stopped before it was done")
+
     config = load(PlayConfig, argv, prog=PROG, section="play")
     set_up_logging(config.log_level, "evaluator")
     started = time.monotonic()
@@ -80,7 +91,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
         check_tools()
     env = task_of(policy.contract, config.env, config.noise, config.rounds)
     rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
-    found = measures(play_match(policy, rallies, env, config.envs))
+    found = measures(play_match(policy, rallies, env, config.envs, breathe))
     about: dict[str, Any] = {
         "launch": config.launch,
         "noise": config.noise,
@@ -90,7 +101,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     }
     if config.film_rallies:
         about["video"] = config.video
-        film(policy, _first(rallies, config.film_rallies), env, config)
+        film(policy, _first(rallies, config.film_rallies), env, config, breathe)
     about["seconds"] = round(time.monotonic() - started, 2)
     print_measures(found | about, config.json_line)
     return DONE
@@ -116,8 +127,10 @@ def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvC
     )
 
 
-def film(policy: Policy, rallies: RallyBlock, env: EnvConfig, config: PlayConfig) -> None:
-    """Play ``rallies`` once more, from home, and write the film."""
+def film(
+    policy: Policy, rallies: RallyBlock, env: EnvConfig, config: PlayConfig, breathe: Callable[[], None]
+) -> None:
+    """Play ``rallies`` once more, from home, and write the film; ``breathe`` is called between pictures."""
     options = FilmOptions(
         config.width,
         config.height,
@@ -127,17 +140,15 @@ def film(policy: Policy, rallies: RallyBlock, env: EnvConfig, config: PlayConfig
         note=f"{config.launch} balls, noise {config.noise}",
     )
     recorded = record(policy.act, rallies, env)
-    log.info(
-        "filming rallies=%d pictures=%d file=%s",
-        len(recorded),
-        picture_count(recorded, options),
-        config.video,
-    )
-    began = time.monotonic()
-    count = write_film(
-        Path(config.video), pictures(recorded, options), config.width, config.height, config.rate_hz
-    )
-    log.info("filmed pictures=%d seconds=%.0f file=%s", count, time.monotonic() - began, config.video)
+    total = picture_count(recorded, options)
+    log.info("filming rallies=%d pictures=%d file=%s", len(recorded), total, config.video)
+
+    def watched() -> Iterator[Image]:
+        for picture in pictures(recorded, options):
+            breathe()
+            yield picture
+
+    write_film(Path(config.video), watched(), config.width, config.height, config.rate_hz)
 
 
 def print_measures(found: dict[str, Any], as_json: bool) -> None:

@@ -56,6 +56,14 @@ def test_play_films_the_first_rallies(folder, tmp_path, capsys):
     assert video.stat().st_size > 10_000
 
 
+def test_play_stops_when_it_is_asked_to(folder):
+    stop = Event()
+    stop.set()
+
+    with pytest.raises(play.StoppedError, match="stopped before it was done"):
+        play.main(["--policy", str(folder), "--film-rallies", "0"], stop)
+
+
 @pytest.mark.parametrize("name", SUBCOMMANDS)
 def test_a_command_has_its_own_help(name, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluator", name, "--help"])
