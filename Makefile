@@ -6,8 +6,11 @@ STAMP := $(VENV)/.installed
 MINUTES ?=
 ACTORS ?= 2
 RUN ?=
+POLICY ?=
+VIDEO ?=
+OUT ?=
 
-.PHONY: help install train play test test-fast check fix bench clean
+.PHONY: help install train play pictures test test-fast check fix bench clean
 
 help:                     ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
@@ -23,8 +26,11 @@ $(STAMP): pyproject.toml
 train: $(STAMP)           ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
 	$(BIN)/python -m deploy.local --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
 
-play: $(STAMP)            ## measure the newest run's policy on rallies that its own evaluator does not play
-	$(BIN)/python -m services.evaluator --policy runs/latest/policy/latest --rallies 1000 --seed 1 --json
+play: $(STAMP)            ## measure a policy and film it: make play [POLICY=folder] [VIDEO=runs/play.mp4]
+	$(BIN)/python -m services.evaluator play $(if $(POLICY),--policy $(POLICY)) $(if $(VIDEO),--video $(VIDEO))
+
+pictures: $(STAMP)        ## draw the README's pictures: make pictures [POLICY=folder] [OUT=docs/pictures]
+	$(BIN)/python -m services.evaluator pictures $(if $(POLICY),--policy $(POLICY)) $(if $(OUT),--out $(OUT))
 
 test: $(STAMP)            ## all tests
 	$(BIN)/python -m pytest

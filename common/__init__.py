@@ -12,6 +12,6 @@ Arrays
 Layers
     deploy -> services -> common, never back. ``common.physics`` and ``common.rally`` are pure: numpy and
     numba only. Each edge library lives in one place: msgpack in ``comms/codec.py``, Zenoh in
-    ``comms/zenoh_transport.py``, Prometheus in ``metrics.py``, MuJoCo in ``env/``, torch in ``policy/``
-    and the learner.
+    ``comms/zenoh_transport.py``, Prometheus in ``metrics.py``, MuJoCo in ``env/``, its renderer with OpenGL, PIL and
+    ffmpeg in ``render/``, torch in ``policy/`` and the learner.
 """

@@ -1,0 +1,164 @@
+"""`python -m services.evaluator play`: measure a policy on fixed rallies, and film the first of them."""
+
+import json
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from threading import Event
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.config import load
+from common.env.rally_env import EnvConfig
+from common.errors import ReportedError
+from common.log import set_up_logging
+from common.policy.weights import Contract, Policy, load_policy
+from common.process import DONE
+from common.rally.launch import RallyBlock
+from common.render.film import FilmOptions, check_tools, picture_count, pictures, write_film
+from common.render.gl import Image
+from common.render.rally_recorder import record
+from common.run_folder import LATEST, RunFolder
+from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.measures import measures
+
+log = logging.getLogger(__name__)
+
+PROG: Final = "python -m services.evaluator play"
+SHIPPED_POLICY: Final = Path("assets/policies/default")
+
+
+class StoppedError(ReportedError):
+    """Somebody asked the command to stop before it was done."""
+
+
+class PlayConfig(BaseModel):
+    """Measure a policy on fixed rallies and film the first of them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    policy: str = Field(
+        "", description=f"policy folder; empty: {SHIPPED_POLICY} if it is there, else the latest run's best"
+    )
+    video: str = Field("runs/play.mp4", pattern=r"\.mp4$", description="film to write, H.264")
+    rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to measure on")
+    film_rallies: int = Field(8, ge=0, le=200, description="rallies to film, the first ones; 0: no film")
+    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
+    rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
+    seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
+    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    camera: Literal["side", "behind", "target", "follow"] = Field(
+        "side", description="where the film is taken from; follow goes with the ball"
+    )
+    slow: float = Field(
+        1.0, ge=0.05, le=1, description="speed of the film; 0.25 is four times slower than real time"
+    )
+    width: int = Field(
+        1280, ge=320, le=3840, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
+    )
+    height: int = Field(
+        720, ge=180, le=2160, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
+    )
+    rate_hz: float = Field(
+        50.0, ge=10, le=100, description="pictures a second", json_schema_extra={"unit": "Hz"}
+    )
+    json_line: bool = Field(
+        False, alias="json", description="print the measures as one JSON object, last line"
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="least severe lines logged"
+    )
+    env: EnvConfig = EnvConfig()
+
+
+def main(argv: Sequence[str], stop: Event) -> int:
+    """Measure and film; return the exit status."""
+
+    def breathe() -> None:
+        if stop.is_set():
+            raise StoppedError("stopped before it was done")
+
+    config = load(PlayConfig, argv, prog=PROG, section="play")
+    set_up_logging(config.log_level, "evaluator")
+    started = time.monotonic()
+    folder = policy_folder(config.policy)
+    policy = load_policy(folder)
+    if config.film_rallies:
+        check_tools()
+    env = task_of(policy.contract, config.env, config.noise, config.rounds)
+    rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
+    found = measures(play_match(policy, rallies, env, config.envs, breathe))
+    about: dict[str, Any] = {
+        "launch": config.launch,
+        "noise": config.noise,
+        "rounds": config.rounds,
+        "seed": config.seed,
+        "policy": str(folder),
+    }
+    if config.film_rallies:
+        about["video"] = config.video
+        film(policy, _first(rallies, config.film_rallies), env, config, breathe)
+    about["seconds"] = round(time.monotonic() - started, 2)
+    print_measures(found | about, config.json_line)
+    return DONE
+
+
+def policy_folder(given: str) -> Path:
+    """Return the folder of the policy that is meant: the one given, the shipped one, or the latest run's best."""
+    if given:
+        return Path(given)
+    return SHIPPED_POLICY if SHIPPED_POLICY.exists() else RunFolder.of(LATEST).best_policy
+
+
+def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:
+    """Return the task for a policy: robot, control rate and observation are its contract's."""
+    return env.model_copy(
+        update={
+            "noise": noise,
+            "rounds": rounds,
+            "control_rate_hz": contract.control_rate_hz,
+            "robot": contract.robot,
+            "observation": contract.observation_options,
+        }
+    )
+
+
+def film(
+    policy: Policy, rallies: RallyBlock, env: EnvConfig, config: PlayConfig, breathe: Callable[[], None]
+) -> None:
+    """Play ``rallies`` once more, from home, and write the film; ``breathe`` is called between pictures."""
+    options = FilmOptions(
+        config.width,
+        config.height,
+        config.rate_hz,
+        config.slow,
+        config.camera,
+        note=f"{config.launch} balls, noise {config.noise}",
+    )
+    recorded = record(policy.act, rallies, env)
+    total = picture_count(recorded, options)
+    log.info("filming rallies=%d pictures=%d file=%s", len(recorded), total, config.video)
+
+    def watched() -> Iterator[Image]:
+        for picture in pictures(recorded, options):
+            breathe()
+            yield picture
+
+    write_film(Path(config.video), watched(), config.width, config.height, config.rate_hz)
+
+
+def print_measures(found: dict[str, Any], as_json: bool) -> None:
+    """Print measures for a person, or as one JSON line."""
+    if as_json:
+        sys.stdout.write(json.dumps(found) + "\n")
+        return
+    for name, value in found.items():
+        sys.stdout.write(f"{name:>24}  {value}\n")
+
+
+def _first(rallies: RallyBlock, count: int) -> RallyBlock:
+    return RallyBlock(rallies.launches[:count], rallies.seeds[:count], rallies.drawn)
