@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.metadata import version as package_version
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ class Contract(BaseModel):
     robot: str
     launch: str
     noise: str
+    env: dict[str, Any] = {}  # every setting of the task it was trained in
     run: str
     generation: int
     version: int
@@ -78,6 +80,34 @@ ACTION_CONTRACT = _described(ACTION)
 def observation_contract(config: ObservationConfig) -> tuple[dict[str, Any], ...]:
     """Return what a policy with these options sees, for its contract."""
     return _described(policy_layout(config))
+
+
+def contract_of(task: BaseModel, network: NetworkConfig, launch: str, *, run: str, **where: int) -> Contract:
+    """Return the contract of a policy that is trained now.
+
+    Args:
+        task: The environment's settings (``EnvConfig``).
+        network: The network's.
+        launch: Preset of the rallies.
+        run: Name of the run.
+        where: generation, version, stage and frames.
+    """
+    env = task.model_dump(mode="json")
+    options = ObservationConfig.model_validate(env["observation"])
+    return Contract(
+        observation=observation_contract(options),
+        observation_options=options,
+        action=ACTION_CONTRACT,
+        network=network,
+        control_rate_hz=env["control_rate_hz"],
+        robot=env["robot"],
+        launch=launch,
+        noise=env["noise"],
+        env=env,
+        run=run,
+        made_with={name: package_version(name) for name in ("topspin", "mujoco", "torch", "numpy")},
+        **where,
+    )
 
 
 def task_hash(network: NetworkConfig, env: Mapping[str, Any], launch: str) -> str:

@@ -68,7 +68,9 @@ def play_match(
     """
     envs = min(envs, len(rallies.seeds))
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
-    env = RallyEnv(envs, config.model_copy(update={"go_on": 0.0}), FixedRallies(rallies, filler), stage=3)
+    env = RallyEnv(
+        envs, config.model_copy(update={"go_on": 0.0, "foresee": 0.0}), FixedRallies(rallies, filler), stage=3
+    )
     obs = env.reset()
     ended: list[FinishedRallies] = []
     left = len(rallies.seeds)

@@ -115,7 +115,7 @@ def policy_folder(given: str) -> Path:
 
 
 def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:
-    """Return the task for a policy: robot, control rate and observation are its contract's."""
+    """Return the task for a policy: robot, control rate, observation and the ball's flight are its contract's."""
     return env.model_copy(
         update={
             "noise": noise,
@@ -123,6 +123,7 @@ def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvC
             "control_rate_hz": contract.control_rate_hz,
             "robot": contract.robot,
             "observation": contract.observation_options,
+            "flight": contract.env.get("flight", env.flight),
         }
     )
 

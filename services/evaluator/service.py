@@ -13,13 +13,12 @@ from common.comms.messages import Command, Control, ControlReply, PolicySnapshot
 from common.comms.transport import Flow, Reply, Transport
 from common.metrics import Metrics
 from common.policy.weights import (
-    ACTION_CONTRACT,
     Contract,
     Policy,
     PolicyError,
+    contract_of,
     load_policy,
     new_network,
-    observation_contract,
     observation_moments,
     save_policy,
     unpack,
@@ -239,16 +238,11 @@ class EvaluatorService:
             )
 
     def _contract(self, snapshot: PolicySnapshot) -> Contract:
-        env = self._config.env
-        return Contract(
-            observation=observation_contract(env.observation),
-            observation_options=env.observation,
-            action=ACTION_CONTRACT,
-            network=self._config.network,
-            control_rate_hz=env.control_rate_hz,
-            robot=env.robot,
-            launch=self._config.launch,
-            noise=env.noise,
+        config = self._config
+        return contract_of(
+            config.env,
+            config.network,
+            config.launch,
             run=snapshot.run,
             generation=snapshot.generation,
             version=snapshot.version,

@@ -19,11 +19,13 @@ from safetensors.numpy import save_file
 from common.errors import ReportedError
 from common.policy.normalizer import Moments
 from common.policy.weights import PolicyError, load_state, state_tensors
+from services.learner.guard import Health
 from services.learner.training import Progress, Training
 
 FORMAT = 1
 SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
+GOOD = "good"  # folder beside them: the last one from which training went well
 
 _NETWORK, _ADAM = "network.", "adam."
 _MOMENTS = ("obs_moments", "value_moments")
@@ -74,6 +76,16 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     return path
 
 
+def keep(path: Path, folder: Path) -> None:
+    """Let ``folder`` hold the checkpoint ``path`` and no other; the file itself is shared, not copied."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / path.name).unlink(missing_ok=True)
+    os.link(path, folder / path.name)
+    for old in checkpoints(folder):
+        if old.name != path.name:
+            old.unlink(missing_ok=True)
+
+
 def checkpoints(folder: Path) -> list[Path]:
     """Return a run's checkpoints, oldest first."""
     return sorted(folder.glob(f"*{SUFFIX}"))
@@ -102,7 +114,8 @@ def restore(path: Path, training: Training) -> Extras:
             mean, var, count = (tensors[f"{which}.{part}"] for part in ("mean", "var", "count"))
             setattr(training, which, Moments(mean, var, int(count)))
         training.generator.set_state(torch.from_numpy(np.array(tensors["shuffle"])))
-        training.progress = Progress(**about["progress"])
+        progress = about["progress"]
+        training.progress = Progress(**progress | {"health": Health(**progress.get("health", {}))})
         return Extras(**about["extras"])
     except (PolicyError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"checkpoint {path} doesn't fit this configuration: {error}") from None

@@ -8,6 +8,7 @@ from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
 from common.service_config import ServiceConfig
 from services.learner.curriculum import CurriculumConfig
+from services.learner.guard import GuardConfig
 from services.learner.intake import IntakeConfig
 from services.learner.ppo import PPOConfig
 
@@ -22,6 +23,7 @@ class LearnerConfig(ServiceConfig):
     network: NetworkConfig = NetworkConfig()
     ppo: PPOConfig = PPOConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
+    guard: GuardConfig = GuardConfig()
     intake: IntakeConfig = IntakeConfig()
     launch: Literal["paper", "strong", "match"] = Field(
         "paper", description="launch preset, as the generators'"

@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version as package_version
 from threading import Event
 
 from common.comms.codec import DecodeError, decode_one_of, encode
@@ -26,14 +25,7 @@ from common.config import to_toml
 from common.env.robot import home_action
 from common.errors import ReportedError
 from common.metrics import Metrics
-from common.policy.weights import (
-    ACTION_CONTRACT,
-    Contract,
-    observation_contract,
-    pack,
-    save_policy,
-    task_hash,
-)
+from common.policy.weights import Contract, contract_of, pack, save_policy, task_hash
 from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
@@ -105,6 +97,7 @@ class LearnerService:
             config.seed,
             notice=max(1, config.intake.lag_aimed_at),
             observation=config.env.observation,
+            guard=config.guard,
         )
         self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._generation = int(time.time())
@@ -217,6 +210,8 @@ class LearnerService:
             trained_seconds=self.seconds,
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
+        if self.training.progress.health.is_good:
+            checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
         save_policy(
             self._folder.latest_policy, self.training.network, self.training.obs_moments, self._contract()
         )
@@ -235,6 +230,8 @@ class LearnerService:
             log.info("first batch trained seconds=%.1f frames=%d", now - clocks.born, stats.frames)
         if stats.stage_changed:
             self._note_stage("curriculum")
+        if stats.diverged:
+            self._go_back(stats.diverged)
         self._intake.finish_update(self._standing())
         self._publish_policy()
         if stats.stage_changed:
@@ -249,6 +246,19 @@ class LearnerService:
         self._record.append(row(stats, self.seconds, rate))
         self._measure(stats, rate, now - started)
         self._warned = False
+
+    def _go_back(self, reason: str) -> None:
+        """Return to the last good checkpoint, if there is one."""
+        good = checkpoint.checkpoints(self._folder.checkpoints / checkpoint.GOOD)
+        if not good:
+            log.error(
+                "training has diverged reason=%r, and there is no good checkpoint to go back to", reason
+            )
+            return
+        path = good[-1]
+        self.training.go_back(lambda training: checkpoint.restore(path, training))
+        self._metrics.inc("topspin_rollbacks_total")
+        log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
 
     def _note_stage(self, reason: str) -> None:
         progress = self.training.progress
@@ -403,21 +413,15 @@ class LearnerService:
 
     def _contract(self) -> Contract:
         config, progress = self._config, self.training.progress
-        return Contract(
-            observation=observation_contract(config.env.observation),
-            observation_options=config.env.observation,
-            action=ACTION_CONTRACT,
-            network=config.network,
-            control_rate_hz=config.env.control_rate_hz,
-            robot=config.env.robot,
-            launch=config.launch,
-            noise=config.env.noise,
+        return contract_of(
+            config.env,
+            config.network,
+            config.launch,
             run=config.run,
             generation=self._generation,
             version=progress.version,
             stage=progress.stage,
             frames=progress.frames,
-            made_with={name: package_version(name) for name in ("topspin", "mujoco", "torch", "numpy")},
         )
 
     def _measure(self, stats: EpochStats, rate: float, update_s: float) -> None:

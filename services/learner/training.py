@@ -1,7 +1,7 @@
 """The learner's state and one epoch of it: datasets in, updates out. No clock, no network, no files."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, criti
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
 from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
+from services.learner.guard import GuardConfig, Health, divergence, watched
 from services.learner.ppo import (
     Dataset,
     PPOConfig,
@@ -43,6 +44,8 @@ class Progress:
     learning_rate: float = 5e-4
     catch_rate: float = float("nan")  # running, with exploration noise
     refitting: bool = False  # the stage has changed, and the critic learns its rewards first
+    health: Health = field(default_factory=Health)
+    rollbacks: int = 0  # times that training went back to a good checkpoint
     closing: int = 0  # datasets that the stage still takes once its gate has opened; 0: it hasn't
 
 
@@ -69,6 +72,7 @@ class EpochStats:
     update: UpdateStats
     play: PlayStats
     stage_changed: bool
+    diverged: str  # why training has diverged, or nothing
     lag: float  # mean of (version before the update - version that played)
     frames: int
 
@@ -106,6 +110,7 @@ class Training:
         seed: Of the network's start and the minibatches' shuffle.
         notice: Datasets that a stage still takes after its gate has opened: those that are being collected then.
         observation: What policy and critic see.
+        guard: When training counts as diverged.
     """
 
     def __init__(
@@ -117,6 +122,7 @@ class Training:
         seed: int,
         notice: int = 1,
         observation: ObservationConfig = PAPER_OBSERVATION,
+        guard: GuardConfig = GuardConfig(),
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
@@ -127,6 +133,7 @@ class Training:
         self.ppo = ppo
         self.curriculum = curriculum
         self.notice = notice
+        self.guard = guard
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
@@ -200,6 +207,11 @@ class Training:
         if before.closing == 1:
             stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
+        measure = play.returned if before.stage == 3 else play.caught
+        rate = measure / play.rallies if play.rallies else float("nan")
+        # While the critic alone learns, the policy can't have gone wrong.
+        health = before.health if is_refitting else watched(before.health, rate, self.guard)
+        finite = all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
         if changed:
             self.obs_moments = self.obs_moments.recounted()
         self.progress = Progress(
@@ -212,10 +224,27 @@ class Training:
             learning_rate=before.learning_rate if is_refitting else stats.learning_rate,
             refitting=changed or is_refitting,
             catch_rate=running,
+            health=Health() if changed else health,
+            rollbacks=before.rollbacks,
             closing=0 if changed else closing,
         )
         lag = float(np.mean([before.version - r.version for r in rollouts]))
-        return EpochStats(self.progress, stats, play, changed, lag, frames)
+        diverged = divergence(health, finite, self.guard)
+        return EpochStats(self.progress, stats, play, changed, diverged, lag, frames)
+
+    def go_back(self, load: Callable[["Training"], object]) -> None:
+        """Take network, optimiser and moments from an earlier moment of this run; time doesn't go back.
+
+        Versions, frames and epochs go on, since actors hold this life's policies. The learning rate starts anew at
+        half of what led here: the same steps on other data might lead here again.
+
+        Args:
+            load: Restores the earlier moment into the training it is given.
+        """
+        now = self.progress
+        load(self)
+        rate = max(0.5 * now.learning_rate, self.ppo.learning_rate_min)
+        self.progress = replace(now, learning_rate=rate, rollbacks=now.rollbacks + 1, health=Health())
 
     def _dataset(self, rollouts: Sequence[Rollout]) -> tuple[Dataset, float]:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""

@@ -1,0 +1,68 @@
+"""Whether training has gone wrong: the paper reports an "unexplained model failure", and a long run must survive one.
+
+A stage's measure is what it is for: balls caught in stages 1 and 2, balls returned in stage 3, as a running mean
+over datasets with exploration noise. Training has diverged when that stays below a share of its best in the
+stage, or when updates are no longer finite. The learner then goes back to its last good checkpoint.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+RUNNING = 0.2  # weight of the newest dataset in the running measure
+GOOD_SHARE = 0.95  # of the stage's best: a checkpoint above it is one to go back to
+
+
+class GuardConfig(BaseModel):
+    """When training counts as diverged."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    collapse: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="share of the stage's best rate below which training has diverged; 0: never",
+    )
+    least: float = Field(0.2, gt=0, le=1, description="best rate from which on a stage is watched")
+    patience: int = Field(20, ge=1, le=10_000, description="epochs below that share before it is believed")
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """How the stage's measure has gone; a value of its own for each stage."""
+
+    rate: float = float("nan")  # running
+    best: float = 0.0  # highest running rate of the stage
+    low_epochs: int = 0  # epochs in a row below the share
+
+    @property
+    def is_good(self) -> bool:
+        """Whether what is learned now is worth going back to."""
+        return self.low_epochs == 0 and self.rate >= GOOD_SHARE * self.best
+
+
+def watched(health: Health, rate: float, config: GuardConfig) -> Health:
+    """Return ``health`` after a dataset in which the stage's measure was ``rate`` (nan: no rally ended)."""
+    if np.isnan(rate):
+        return health
+    running = rate if np.isnan(health.rate) else (1 - RUNNING) * health.rate + RUNNING * rate
+    best = max(health.best, running)
+    is_low = best >= config.least and running < config.collapse * best
+    return Health(running, best, health.low_epochs + 1 if is_low else 0)
+
+
+def divergence(health: Health, finite: bool, config: GuardConfig) -> str:
+    """Return why training has diverged, or nothing.
+
+    Args:
+        health: After the newest dataset.
+        finite: Whether the parameters are.
+        config: When.
+    """
+    if not finite:
+        return "parameters are not finite"
+    if health.low_epochs >= config.patience:
+        return f"rate {health.rate:.3f} for {health.low_epochs} epochs, best was {health.best:.3f}"
+    return ""
