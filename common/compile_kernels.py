@@ -7,14 +7,19 @@ import numpy as np
 
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import EnvConfig, RallyEnv
+from common.physics.flight import SIMPLE
+from common.rally.launch import LAUNCH_SIZE
+from common.rally.noise import CONDITIONS
+from common.rally.undisturbed import undisturbed
 
 
 def compile_kernels() -> None:
-    """Play a few steps; whatever runs in play is compiled after it."""
+    """Play a few steps; whatever runs in play or in a match is compiled after it."""
     env = RallyEnv(2, EnvConfig(), LocalRallies(seed=0))
     env.reset()
     for _ in range(3):
         env.step(np.zeros((2, 7)))
+    undisturbed(np.ones((1, LAUNCH_SIZE)), np.ones((1, CONDITIONS)), SIMPLE)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from pydantic_settings import BaseSettings, InitSettingsSource, PydanticBaseSett
 from common.config_help import Setting, format_help, settings_of
 
 ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
-SECTIONS: Final = ("generator", "actor", "learner", "evaluator", "local", "play", "pictures")
+SECTIONS: Final = ("generator", "actor", "learner", "evaluator", "local", "play", "pictures", "report")
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

@@ -103,6 +103,7 @@ class FinishedRallies:
     returns: Floats  # (n,) undiscounted reward of the rally
     lengths: npt.NDArray[np.int32]  # (n,) control steps
     conditions: Array  # (n, 14) noise.Condition
+    rounds: npt.NDArray[np.int32]  # (n,) which rally of its episode: 1 for the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +175,7 @@ class RallyEnv:
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
         self._lengths = np.zeros(count, np.int32)
+        self._rounds = np.zeros(count, np.int32)
         self._all = np.arange(count)
         self._obs = np.zeros((count, size(critic_layout(config.observation))), np.float32)
         self._rewards = reward_table(config.reward)
@@ -290,6 +292,7 @@ class RallyEnv:
             returns=self._returns[rows].astype(np.float32),
             lengths=self._lengths[rows],
             conditions=r.condition[rows],
+            rounds=self._rounds[rows],
         )
 
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
@@ -299,6 +302,7 @@ class RallyEnv:
         self._validated[rows] = launches.validated
         self._returns[rows] = 0.0
         self._lengths[rows] = 0
+        self._rounds[rows] = np.where(same_episode, self._rounds[rows] + 1, 1)
         gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
         config = self.config
         stay, go_on, ends = _draw_robot(

@@ -10,7 +10,10 @@ from common.service_config import ServiceConfig
 
 
 class EvaluatorConfig(ServiceConfig):
-    """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best."""
+    """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best.
+
+    `report RUN...` in the place of flags compares runs; it has settings of its own.
+    """
 
     policy: str = Field("", description="policy folder to play once; empty: follow the run")
     rallies: int = Field(

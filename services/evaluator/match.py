@@ -10,9 +10,12 @@ from common.env.rally_env import EnvConfig, FinishedRallies, Launches, RallyEnv
 from common.physics.flight import FULL, SIMPLE
 from common.policy.weights import Policy
 from common.rally.launch import Purpose, RallyBlock, draw_rallies
+from common.rally.noise import Condition
+from common.rally.undisturbed import undisturbed
 from services.evaluator.measures import Played
 
 DEFAULT_ENVS = 250
+EPISODES_EACH = 4  # whole ones that an environment has rallies for
 
 
 class FixedRallies:
@@ -61,16 +64,18 @@ def play_match(
         policy: Who plays.
         rallies: What is played, each once.
         config: The task.
-        envs: Environments played together.
+        envs: Environments played together, at most.
         breathe: Called between control steps, so that the caller can look after other things, or raise.
 
     A rally in which the simulation failed is left out: there are fewer rows then.
     """
-    envs = min(envs, len(rallies.seeds))
+    # Where episodes go on, each environment needs room for many, or the set would be dealt as first balls alone.
+    room = len(rallies.seeds) // (EPISODES_EACH * config.rounds) if config.rounds > 1 else len(rallies.seeds)
+    envs = min(envs, max(1, room))
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
-    env = RallyEnv(
-        envs, config.model_copy(update={"go_on": 0.0, "foresee": 0.0}), FixedRallies(rallies, filler), stage=3
-    )
+    # What shortens or lengthens training episodes has no place in a match: every flight is played to its end.
+    task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0})
+    env = RallyEnv(envs, task, FixedRallies(rallies, filler), stage=3)
     obs = env.reset()
     ended: list[FinishedRallies] = []
     left = len(rallies.seeds)
@@ -86,11 +91,27 @@ def play_match(
     def rated(name: str) -> npt.NDArray[Any]:
         return np.concatenate([getattr(f, name)[f.validated] for f in ended])
 
+    seeds, conditions = rated("seeds"), rated("conditions")
+    launches = launches_of(seeds, rallies)
+    model = SIMPLE if config.flight == "simple" else FULL
+    bounces, arrivals = undisturbed(launches, conditions, model)
     return Played(
-        seeds=rated("seeds"),
+        seeds=seeds,
         outcomes=rated("outcomes"),
         landing_errors=rated("landing_errors"),
         caught=rated("caught"),
         over=rated("over"),
         returns=rated("returns"),
+        rounds=rated("rounds"),
+        launches=launches,
+        landings=rated("landings"),
+        targets=conditions[:, [Condition.TARGET_X, Condition.TARGET_Y]],
+        bounces=bounces[:, :2],
+        arrivals=arrivals,
     )
+
+
+def launches_of(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.float64]:
+    """Return the launches (n, 11) of the rallies with these seeds (n,), all of which ``rallies`` must hold."""
+    order = np.argsort(rallies.seeds)
+    return rallies.launches[order[np.searchsorted(rallies.seeds, seeds, sorter=order)]]

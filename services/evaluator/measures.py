@@ -5,13 +5,16 @@ return after catch = return / catch; target error = planar distance of legal lan
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from common.rally.trajectory import Outcome
+
+Array = npt.NDArray[np.float64]
 
 Z_95 = 1.959963984540054  # two-sided 95 %
 WITHIN_M = (0.2, 0.3)  # [m] shares of landings nearer than these
@@ -27,6 +30,24 @@ class Played:
     caught: npt.NDArray[np.bool_]  # (n,)
     over: npt.NDArray[np.bool_]  # (n,)
     returns: npt.NDArray[np.float32]  # (n,) reward
+    rounds: npt.NDArray[np.int32]  # (n,) which rally of its episode: 1 for the first
+    launches: Array  # (n, 11) position [m], velocity [m/s], spin [rad/s], drag and lift factor
+    landings: npt.NDArray[np.float32]  # (n, 2) [m] on the opponent's court, nan where nothing landed
+    targets: Array  # (n, 2) [m]
+    bounces: Array  # (n, 2) [m] on the robot's court
+    arrivals: (
+        Array  # (n, 3) [m] at the end of the table, unplayed; nan where the ball bounces twice before it
+    )
+
+    def of(self, chosen: npt.NDArray[np.bool_]) -> "Played":
+        """Return the rallies that ``chosen`` (n,) marks."""
+        return Played(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+
+    @staticmethod
+    def together(parts: Sequence["Played"]) -> "Played":
+        """Return the rallies of several matches as one."""
+        names = [field.name for field in fields(Played)]
+        return Played(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:

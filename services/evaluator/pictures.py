@@ -16,7 +16,8 @@ from common.process import DONE
 from common.render.rally_recorder import record
 from common.render.stills import rally_picture, rally_strip, save_png, showpiece
 from services.evaluator.match import evaluation_rallies
-from services.evaluator.play import SHIPPED_POLICY, policy_folder, task_of
+from services.evaluator.once import task_of
+from services.evaluator.play import SHIPPED_POLICY, policy_folder
 
 log = logging.getLogger(__name__)
 

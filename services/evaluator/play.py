@@ -1,38 +1,31 @@
 """`python -m services.evaluator play`: measure a policy on fixed rallies, and film the first of them."""
 
-import json
 import logging
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from threading import Event
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.config import load
 from common.env.rally_env import EnvConfig
-from common.errors import ReportedError
 from common.log import set_up_logging
-from common.policy.weights import Contract, Policy, load_policy
+from common.policy.weights import Policy, load_policy
 from common.process import DONE
 from common.rally.launch import RallyBlock
 from common.render.film import FilmOptions, check_tools, picture_count, pictures, write_film
 from common.render.gl import Image
 from common.render.rally_recorder import record
 from common.run_folder import LATEST, RunFolder
-from services.evaluator.match import evaluation_rallies, play_match
-from services.evaluator.measures import measures
+from services.evaluator import once
+from services.evaluator.match import evaluation_rallies
 
 log = logging.getLogger(__name__)
 
 PROG: Final = "python -m services.evaluator play"
 SHIPPED_POLICY: Final = Path("assets/policies/default")
-
-
-class StoppedError(ReportedError):
-    """Somebody asked the command to stop before it was done."""
 
 
 class PlayConfig(BaseModel):
@@ -79,8 +72,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and film; return the exit status."""
 
     def breathe() -> None:
-        if stop.is_set():
-            raise StoppedError("stopped before it was done")
+        once.check(stop)
 
     config = load(PlayConfig, argv, prog=PROG, section="play")
     set_up_logging(config.log_level, "evaluator")
@@ -89,21 +81,16 @@ def main(argv: Sequence[str], stop: Event) -> int:
     policy = load_policy(folder)
     if config.film_rallies:
         check_tools()
-    env = task_of(policy.contract, config.env, config.noise, config.rounds)
-    rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
-    found = measures(play_match(policy, rallies, env, config.envs, breathe))
-    about: dict[str, Any] = {
-        "launch": config.launch,
-        "noise": config.noise,
-        "rounds": config.rounds,
-        "seed": config.seed,
-        "policy": str(folder),
-    }
+    env = once.task_of(policy.contract, config.env, config.noise, config.rounds)
+    found = once.measure(policy, folder, env, config, breathe)
     if config.film_rallies:
-        about["video"] = config.video
-        film(policy, _first(rallies, config.film_rallies), env, config, breathe)
-    about["seconds"] = round(time.monotonic() - started, 2)
-    print_measures(found | about, config.json_line)
+        found["video"] = config.video
+        rallies = evaluation_rallies(
+            config.film_rallies, config.launch, config.noise, config.seed, env.flight
+        )
+        film(policy, rallies, env, config, breathe)
+    found["seconds"] = round(time.monotonic() - started, 2)
+    once.print_measures(found, config.json_line)
     return DONE
 
 
@@ -112,20 +99,6 @@ def policy_folder(given: str) -> Path:
     if given:
         return Path(given)
     return SHIPPED_POLICY if SHIPPED_POLICY.exists() else RunFolder.of(LATEST).best_policy
-
-
-def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:
-    """Return the task for a policy: robot, control rate, observation and the ball's flight are its contract's."""
-    return env.model_copy(
-        update={
-            "noise": noise,
-            "rounds": rounds,
-            "control_rate_hz": contract.control_rate_hz,
-            "robot": contract.robot,
-            "observation": contract.observation_options,
-            "flight": contract.env.get("flight", env.flight),
-        }
-    )
 
 
 def film(
@@ -150,16 +123,3 @@ def film(
             yield picture
 
     write_film(Path(config.video), watched(), config.width, config.height, config.rate_hz)
-
-
-def print_measures(found: dict[str, Any], as_json: bool) -> None:
-    """Print measures for a person, or as one JSON line."""
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-        return
-    for name, value in found.items():
-        sys.stdout.write(f"{name:>24}  {value}\n")
-
-
-def _first(rallies: RallyBlock, count: int) -> RallyBlock:
-    return RallyBlock(rallies.launches[:count], rallies.seeds[:count], rallies.drawn)

@@ -241,6 +241,18 @@ def test_the_last_round_of_an_episode_terminates():
     assert ends == [False, True]
 
 
+def test_rallies_are_numbered_within_their_episode():
+    env = make_env(1, QUIET.model_copy(update={"rounds": 3}))
+    env.reset()
+    numbers = []
+    for is_returned in (True, True, True, True, False, False):
+        if is_returned:
+            drop_on(env, 0.7)
+        numbers.append(int(play_until_end(env).finished.rounds[0]))
+
+    assert numbers == [1, 2, 3, 1, 2, 1]
+
+
 def test_a_rally_that_is_lost_ends_an_episode_of_many_rounds():
     env = make_env(1, QUIET.model_copy(update={"rounds": 10}))
     env.reset()

@@ -2,11 +2,16 @@ import numpy as np
 import pytest
 
 from common.env.rally_env import EnvConfig, RallyEnv
+from common.physics.flight import SIMPLE
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
 from common.policy.weights import ACTION_CONTRACT, Contract, Policy, new_network, observation_contract
 from common.rally.launch import Purpose, draw_rallies
+from common.rally.noise import CONDITIONS, PROFILES, draw_conditions
 from common.rally.observation import critic_layout, size
+from common.rally.trajectory import Outcome, State
+from common.rally.undisturbed import undisturbed
+from services.evaluator.breakdown import survival
 from services.evaluator.match import FixedRallies, evaluation_rallies, play_match
 
 NETWORK = NetworkConfig(units=(16, 8))
@@ -110,3 +115,99 @@ def test_a_fault_of_the_simulation_costs_one_rally_and_the_match_still_ends(tmp_
     assert len(broken) == 1
     assert len(played.seeds) == 5
     assert set(played.seeds) < set(rallies.seeds)
+
+
+def test_launches_targets_and_flights_are_those_of_the_rallies_beside_them():
+    rallies = evaluation_rallies(30, "paper", "standard", seed=4)
+    played = play_match(make_policy(), rallies, EnvConfig(), envs=7)
+
+    assert not np.array_equal(played.seeds, rallies.seeds)  # they end in another order than they begin
+    for k, seed in enumerate(played.seeds):
+        row = int(np.flatnonzero(rallies.seeds == seed)[0])
+        condition = np.empty(CONDITIONS)
+        drag, lift = rallies.launches[row, 9:]
+        draw_conditions(seed, drag, lift, PROFILES["standard"], condition)
+        bounce, arrival = undisturbed(rallies.launches[row : row + 1], condition[None], SIMPLE)
+        np.testing.assert_array_equal(played.launches[k], rallies.launches[row])
+        np.testing.assert_array_equal(played.targets[k], condition[8:10])
+        np.testing.assert_array_equal(played.bounces[k], bounce[0, :2])
+        np.testing.assert_array_equal(played.arrivals[k], arrival[0])
+
+
+def is_returned(seeds):
+    """Return which rallies the scripted robot returns: two of three."""
+    return np.asarray(seeds) % np.uint64(3) > 0
+
+
+@pytest.fixture
+def scripted_returns(monkeypatch):
+    """Let balls of ``is_returned`` fall onto the opponent's court in their first step, as if they had been hit."""
+    envs = []
+    step = RallyEnv.step
+
+    def step_with_returns(env, actions):
+        envs.append(env)
+        balls = env.rallies
+        chosen = np.flatnonzero((balls.state == State.TAU_0) & is_returned(balls.seed))
+        balls.ball[chosen] = [0.7, 0.1, 0.1, 0, 0, 0, 0, 0, 0]
+        balls.state[chosen] = State.TAU_23
+        balls.caught[chosen] = True
+        return step(env, actions)
+
+    monkeypatch.setattr(RallyEnv, "step", step_with_returns)
+    return envs
+
+
+@pytest.mark.parametrize("rounds", [1, 3])
+@pytest.mark.parametrize("envs", [1, 4])
+def test_a_rallys_round_counts_the_returns_before_it_in_its_episode(scripted_returns, rounds, envs):
+    rallies = evaluation_rallies(48, "paper", "standard", seed=4)
+    played = play_match(make_policy(), rallies, EnvConfig(rounds=rounds), envs=envs)
+
+    assert scripted_returns[-1].count == envs
+    order = np.argsort(played.seeds)
+    np.testing.assert_array_equal(
+        (played.outcomes == Outcome.RETURNED)[order], is_returned(played.seeds)[order]
+    )
+    assert sorted(played.seeds.tolist()) == sorted(rallies.seeds.tolist())
+    if envs > 1:
+        assert set(played.rounds.tolist()) == set(range(1, rounds + 1))
+        return
+    expected, number = [], 1
+    for returned in is_returned(rallies.seeds):  # one environment plays them as they are dealt
+        expected.append(number)
+        number = number + 1 if returned and number < rounds else 1
+    np.testing.assert_array_equal(played.rounds, expected)
+    np.testing.assert_array_equal(played.seeds, rallies.seeds)
+
+
+def test_survival_of_a_match_is_that_of_its_episodes_followed_one_by_one(scripted_returns):
+    rallies = evaluation_rallies(60, "paper", "standard", seed=5)
+    played = play_match(make_policy(), rallies, EnvConfig(rounds=3), envs=1)
+
+    reached, won, number = [0, 0, 0], [0, 0, 0], 0
+    for returned in is_returned(rallies.seeds):
+        reached[number] += 1
+        won[number] += int(returned)
+        number = number + 1 if returned and number < 2 else 0
+    length = sum(np.prod([won[j] / reached[j] for j in range(k + 1)]) for k in range(3))
+    assert [entry["rallies"] for entry in survival(played)["by_round"]] == reached
+    assert survival(played)["rally_length_mean"] == pytest.approx(length, abs=5e-5)
+
+
+def test_where_episodes_go_on_the_environments_are_few_enough_for_whole_ones(scripted_returns):
+    rallies = evaluation_rallies(60, "paper", "standard", seed=4)
+    played = play_match(make_policy(), rallies, EnvConfig(rounds=3), envs=60)
+
+    assert scripted_returns[-1].count == 5
+    # 2/3 of the balls are returned: of three rounds the first gets 9 of 19
+    assert (played.rounds == 1).mean() < 0.7
+    assert (played.rounds == 3).sum() > 5
+
+
+def test_what_shortens_training_episodes_has_no_place_in_a_match(scripted_returns):
+    rallies = evaluation_rallies(3, "paper", "standard", seed=4)
+    play_match(make_policy(), rallies, EnvConfig(foresee=1.0, go_on=1.0), envs=3)
+
+    assert scripted_returns
+    assert (scripted_returns[-1].config.foresee, scripted_returns[-1].config.go_on) == (0.0, 0.0)

@@ -4,21 +4,9 @@ import numpy as np
 import pytest
 
 from common.rally.trajectory import Outcome
-from services.evaluator.measures import Played, measures, wilson
+from services.evaluator.measures import measures, wilson
 from services.evaluator.service import score
-
-
-def make_played(rows):
-    """Return rallies from (outcome, caught, over, landing error)."""
-    outcomes, caught, over, errors = zip(*rows, strict=True)
-    return Played(
-        seeds=np.arange(len(rows), dtype=np.uint64),
-        outcomes=np.array(outcomes, np.uint8),
-        landing_errors=np.array(errors, np.float32),
-        caught=np.array(caught),
-        over=np.array(over),
-        returns=np.zeros(len(rows), np.float32),
-    )
+from tests.unit.evaluator.played import make_played
 
 
 @pytest.mark.parametrize(

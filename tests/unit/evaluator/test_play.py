@@ -11,8 +11,9 @@ from common.render.gl import RenderError
 from common.render.scene import Painter
 from services.evaluator import play
 from services.evaluator.__main__ import SUBCOMMANDS, main
+from services.evaluator.once import StoppedError, task_of
 from services.evaluator.pictures import PicturesConfig
-from services.evaluator.play import PlayConfig, policy_folder, task_of
+from services.evaluator.play import PlayConfig, policy_folder
 from tests.unit.evaluator.test_match import make_policy
 
 
@@ -60,7 +61,7 @@ def test_play_stops_when_it_is_asked_to(folder):
     stop = Event()
     stop.set()
 
-    with pytest.raises(play.StoppedError, match="stopped before it was done"):
+    with pytest.raises(StoppedError, match="stopped before it was done"):
         play.main(["--policy", str(folder), "--film-rallies", "0"], stop)
 
 

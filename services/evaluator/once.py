@@ -1,0 +1,87 @@
+"""Measuring a policy once, from a folder: what the evaluator does with --policy, and `play` before it films."""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from typing import Any, Protocol
+
+from common.env.rally_env import EnvConfig
+from common.errors import ReportedError
+from common.policy.weights import Contract, Policy
+from services.evaluator.breakdown import breakdown, survival, table
+from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.measures import measures
+
+
+class StoppedError(ReportedError):
+    """Somebody asked the command to stop before it was done."""
+
+
+class MatchSettings(Protocol):
+    """Which rallies are played, and how many together; the evaluator's settings and those of `play` are such."""
+
+    @property
+    def rallies(self) -> int: ...  # noqa: D102
+    @property
+    def launch(self) -> str: ...  # noqa: D102
+    @property
+    def noise(self) -> str: ...  # noqa: D102
+    @property
+    def rounds(self) -> int: ...  # noqa: D102
+    @property
+    def seed(self) -> int: ...  # noqa: D102
+    @property
+    def envs(self) -> int: ...  # noqa: D102
+
+
+def check(stop: Event) -> None:
+    """Raise StoppedError if a stop was asked for."""
+    if stop.is_set():
+        raise StoppedError("stopped before it was done")
+
+
+def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:
+    """Return the task for a policy: robot, control rate, observation and the ball's flight are its contract's."""
+    return env.model_copy(
+        update={
+            "noise": noise,
+            "rounds": rounds,
+            "control_rate_hz": contract.control_rate_hz,
+            "robot": contract.robot,
+            "observation": contract.observation_options,
+            "flight": contract.env.get("flight", env.flight),
+        }
+    )
+
+
+def measure(
+    policy: Policy, folder: Path, env: EnvConfig, config: MatchSettings, breathe: Callable[[], None]
+) -> dict[str, Any]:
+    """Return the measures of a policy over fixed rallies, what was played, and rates by kind of ball (``by``)."""
+    started = time.monotonic()
+    rallies = evaluation_rallies(config.rallies, config.launch, config.noise, config.seed, env.flight)
+    played = play_match(policy, rallies, env, config.envs, breathe)
+    about = {
+        "launch": config.launch,
+        "noise": config.noise,
+        "rounds": config.rounds,
+        "seed": config.seed,
+        "collision": env.collision,
+        "policy": str(folder),
+        "seconds": round(time.monotonic() - started, 2),
+    }
+    return measures(played) | survival(played) | about | {"by": breakdown(played)}
+
+
+def print_measures(found: dict[str, Any], as_json: bool) -> None:
+    """Print measures for a person, or as one JSON line."""
+    if as_json:
+        sys.stdout.write(json.dumps(found) + "\n")
+        return
+    for name, value in found.items():
+        if name != "by":
+            sys.stdout.write(f"{name:>24}  {value}\n")
+    sys.stdout.write("\n".join(table(found["by"])) + "\n")

@@ -1,0 +1,136 @@
+"""Reading a run folder: settings, curves and policy, each of which may be missing, and then it is said."""
+
+import csv
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from common.errors import ReportedError
+from common.policy.weights import Policy, PolicyError, load_policy
+from common.run_folder import RUNS, RunFolder
+
+Array = npt.NDArray[np.float64]
+
+EVALUATIONS: Final = "evaluations.csv"
+CURVES: Final = ("target_error_mean", "catch_rate", "over_rate", "return_rate")
+"""The paper's curves: average target error, catching, returning and return-to-opponent rate."""
+
+
+class RunError(ReportedError):
+    """A run that can't be reported on: one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """A run's epochs, from metrics.csv."""
+
+    frames: Array  # (n,)
+    seconds: Array  # (n,) since the first trained batch, through restarts
+    stages: Array  # (n,)
+
+    def stage_changes(self) -> list[tuple[int, float]]:
+        """Return (stage, frames at which it began) of every stage after the first."""
+        where = np.flatnonzero(np.diff(self.stages)) + 1
+        return [(int(self.stages[k]), float(self.frames[k - 1])) for k in where]
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """What the evaluator measured while a run trained, from report/evaluations.csv."""
+
+    frames: Array  # (n,)
+    minutes: Array  # (n,) of training
+    values: Mapping[str, Array]  # CURVES by name, (n,) each, nan where nothing landed
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a run folder holds."""
+
+    name: str
+    settings: Mapping[str, Any]  # config.toml
+    training: Training | None
+    curve: Curve | None
+    policy: Policy | None
+    missing: tuple[str, ...]  # what is not there, in words
+
+
+def find(run: str) -> RunFolder:
+    """Return the folder of a run, given by name or as a folder; raises RunError with those there are."""
+    for folder in (RunFolder.of(run), RunFolder(Path(run))):
+        if folder.config.is_file():
+            return RunFolder(folder.root.resolve())
+    known = sorted(path.parent.name for path in RUNS.glob("*/config.toml") if not path.parent.is_symlink())
+    there = f"runs there: {', '.join(known)}" if known else f"there are no runs in {RUNS}/"
+    raise RunError(f"no run {run!r}: neither {RUNS}/{run} nor {run} is a folder with a config.toml; {there}")
+
+
+def read(run: str, which: str = "best") -> Run:
+    """Return what the folder of a run holds; ``which`` of its policies: best or latest."""
+    folder = find(run)
+    missing = []
+    try:
+        settings = tomllib.loads(folder.config.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RunError(f"{folder.config} is not TOML: {error}") from None
+    training = _training(folder.metrics)
+    if training is None:
+        missing.append("no epochs in metrics.csv: frames, hours and stages are unknown")
+    curve = _curve(folder.report / EVALUATIONS, training)
+    if curve is None:
+        missing.append(f"no evaluations in report/{EVALUATIONS}: it has no training curves")
+    policy = None
+    path = folder.best_policy if which == "best" else folder.latest_policy
+    try:
+        policy = load_policy(path)
+    except PolicyError as error:
+        other = folder.latest_policy if which == "best" else folder.best_policy
+        hint = f"; it has policy/{other.name}: --policy {other.name}" if other.exists() else ""
+        why = (
+            f"can't be played: {str(error).replace(f'{folder.root}/', '')}"
+            if path.exists()
+            else "isn't there"
+        )
+        missing.append(f"policy/{which} {why}; it has no measures{hint}")
+    if policy is None and curve is None:
+        raise RunError(f"run {folder.root.name!r} has nothing to report: {'; '.join(missing)}")
+    return Run(folder.root.name, settings, training, curve, policy, tuple(missing))
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    """Return the whole rows of a CSV file; a process that was killed may have left half a line at the end."""
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return [row for row in csv.DictReader(file) if None not in row.values() and None not in row]
+
+
+def _column(rows: list[dict[str, str]], name: str) -> Array:
+    return np.array([float(row.get(name) or "nan") for row in rows])
+
+
+def _training(path: Path) -> Training | None:
+    rows = _rows(path)
+    if not rows:
+        return None
+    return Training(*(_column(rows, name) for name in ("frames", "seconds", "stage")))
+
+
+def _curve(path: Path, training: Training | None) -> Curve | None:
+    rows = _rows(path)
+    if not rows:
+        return None
+    frames = _column(rows, "frames")
+    # A resumed run goes on from its newest checkpoint: what was measured after that was measured again.
+    kept = [k for k in range(len(frames)) if frames[k] < frames[k + 1 :].min(initial=np.inf)]
+    rows, frames = [rows[k] for k in kept], frames[kept]
+    # The evaluator's own clock starts anew with each of its lives; the learner's goes on.
+    seconds = _column(rows, "seconds")
+    if training is not None:
+        seconds = np.interp(frames, np.append(0, training.frames), np.append(0, training.seconds))
+    return Curve(frames, seconds / 60, {name: _column(rows, name) for name in CURVES})

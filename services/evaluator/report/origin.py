@@ -1,0 +1,98 @@
+"""How it was made: the commands of the runs, what they took, and the versions and machine of the report."""
+
+import importlib
+import os
+import platform
+import shlex
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from common.config import flag_of
+from common.config_help import settings_of
+from services.evaluator.report.groups import leaves
+
+PROGRAM: Final = "python -m deploy.local"
+PACKAGES: Final = ("topspin", "numpy", "torch", "mujoco", "numba", "eclipse-zenoh")
+UNSAID: Final = frozenset(
+    {"run", "resume", "panel", "endpoint", "metrics_port"}
+)  # how it was watched, or not of ours
+
+
+def run_defaults() -> dict[str, Any]:
+    """Return the defaults of ``deploy.local`` by dotted path; {} where deploy isn't installed.
+
+    It is looked up by its name, as by a person who reads its --help: no code here depends on deploy.
+    """
+    try:
+        model = importlib.import_module("deploy.config").DeployConfig
+    except ModuleNotFoundError:
+        return {}
+    return {path: setting.default for path, setting in settings_of(model).items()}
+
+
+def command(name: str, settings: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
+    """Return the command that makes such a run: its settings that aren't the defaults, as flags.
+
+    Args:
+        name: Of the run.
+        settings: Its config.toml.
+        defaults: Of ``deploy.local`` by dotted path. A setting without one, of another version, is said.
+    """
+    if "local" not in settings:  # its services were started one by one
+        return f"python -m services.learner --config runs/{name}/config.toml"
+    words = [PROGRAM, "--run", name]
+    for path, value in leaves(settings["local"]):
+        default = defaults.get(path)
+        if path not in UNSAID and value != (list(default) if isinstance(default, tuple) else default):
+            words += [f"--{flag_of(path)}", _text(value)]
+    return " ".join(words[:1] + [shlex.quote(word) for word in words[1:]])
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return ",".join(str(item) for item in value)
+    return str(value)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide the numbers, and the commit if there is one."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    commit = _commit(Path(__file__).parent)
+    return found | ({"commit": commit} if commit else {})
+
+
+def machine() -> dict[str, str]:
+    """Return processor and cores of this machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {"processor": _processor(Path("/proc/cpuinfo")), "cores": str(cores), "system": platform.system()}
+
+
+def _processor(cpuinfo: Path) -> str:
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def _commit(folder: Path) -> str:
+    """Return the commit of the sources, with + where they differ from it; empty outside of a repository."""
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+"],
+            cwd=folder, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return described.stdout.strip()

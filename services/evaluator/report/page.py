@@ -1,0 +1,136 @@
+"""The page: tables and plots in order, as report.md and as report.html, which stands alone."""
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+
+from services.evaluator.report import tables
+from services.evaluator.report.figures import Drawing
+from services.evaluator.report.results import NOISE, Results, as_json
+from services.evaluator.report.tables import Table, markdown
+
+TITLE = "Topspin: what the runs came to"
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page; whatever it holds stands in this order."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    missing: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    drawings: tuple[Drawing, ...] = ()
+    code: str = ""
+
+
+def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
+    """Return the page's parts."""
+
+    def named(*beginnings: str) -> tuple[Drawing, ...]:
+        return tuple(drawing for drawing in drawings if drawing.name.startswith(beginnings))
+
+    config = found.settings
+    rounds = tables.rounds(found)
+    parts = [
+        Section(
+            "",
+            (
+                f"Every policy plays the same {config.rallies:,} rallies (launch {config.launch}, noise {NOISE}, "
+                f"seed {config.seed} of the evaluation's own seeds, our collisions), without exploration noise and "
+                "to their end. Runs that differ in nothing but their seed are taken together.",
+            ),
+        ),
+        Section("Missing", missing=found.missing),
+        Section("Beside the paper", tables=(tables.headline(found),)),
+        Section("Training", drawings=named("curves")),
+        Section("Every seed", tables=(tables.by_seed(found),)),
+    ]
+    if any(one.played is not None for one in found.groups):
+        parts += [
+            Section("How rallies ended", tables=(tables.outcomes(found),), drawings=named("outcomes")),
+            Section("Where balls land", drawings=named("landings", "courts")),
+            Section("Ball after ball", tables=(rounds,) if rounds else (), drawings=named("rounds")),
+            Section(
+                "By kind of ball", tables=tuple(tables.by_kind(found)), drawings=named("rates", "errors")
+            ),
+        ]
+    parts.append(Section("How it was made", (_machine(found),), code=_commands(found)))
+    return [part for part in parts if part.text or part.missing or part.tables or part.drawings]
+
+
+def _machine(found: Results) -> str:
+    versions = ", ".join(f"{name} {version}" for name, version in found.versions.items())
+    return (
+        f"Measured on {found.machine['processor']}, {found.machine['cores']} cores, {found.machine['system']}; "
+        f"{versions}. The runs, each by the settings of its config.toml that are not the defaults:"
+    )
+
+
+def _commands(found: Results) -> str:
+    """Return the commands of all runs, with seeds, frames and hours."""
+    lines = []
+    for one in found.groups:
+        lines.append(f"# {one.description}")
+        for result in one.runs:
+            took = f"{tables.count_of(result.frames)} frames in {tables.hours_of(result.seconds)}"
+            lines.append(f"{result.command}  # seed {result.seed}, {took}")
+        lines.append("")
+    config = found.settings
+    runs = " ".join(result.run.name for one in found.groups for result in one.runs)
+    rounds = " --rounds-too" if config.rounds_too else ""
+    lines += [
+        "# this report",
+        f"python -m services.evaluator report {runs} --rallies {config.rallies} --seed {config.seed} "
+        f"--launch {config.launch} --policy {config.policy}{rounds}",
+    ]
+    return "\n".join(lines)
+
+
+def as_markdown(parts: Sequence[Section]) -> str:
+    """Return the page as Markdown with its plots beside it."""
+    lines = [f"# {TITLE}"]
+    for part in parts:
+        if part.title:
+            lines.append(f"## {part.title}")
+        lines += part.text
+        if part.missing:
+            lines.append("\n".join(f"- {line}" for line in part.missing))
+        for table in part.tables:
+            if table.title != part.title:
+                lines.append(f"### {table.title}")
+            lines.append(markdown(table).rstrip())
+            if table.note:
+                lines.append(table.note)
+        for drawing in part.drawings:
+            if drawing.title != part.title:
+                lines.append(f"### {drawing.title}")
+            lines += [f"![{drawing.title}]({drawing.name}.png)", drawing.caption]
+        if part.code:
+            lines.append(f"```\n{part.code}\n```")
+    return "\n\n".join(lines) + "\n"
+
+
+def as_html(parts: Sequence[Section], folder: Path) -> str:
+    """Return the page as HTML that stands alone; the plots are read from ``folder``."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
+    )
+    images = {
+        drawing.name: base64.b64encode((folder / f"{drawing.name}.png").read_bytes()).decode()
+        for part in parts
+        for drawing in part.drawings
+    }
+    return environment.get_template("page.html.j2").render(title=TITLE, sections=parts, images=images)
+
+
+def write(found: Results, drawings: Sequence[Drawing], folder: Path) -> None:
+    """Write report.md, report.html and results.json beside the plots in ``folder``."""
+    parts = sections(found, drawings)
+    (folder / "report.md").write_text(as_markdown(parts), encoding="utf-8")
+    (folder / "report.html").write_text(as_html(parts, folder), encoding="utf-8")
+    (folder / "results.json").write_text(json.dumps(as_json(found), allow_nan=False, indent=1) + "\n")
