@@ -26,7 +26,17 @@ from pydantic_settings import BaseSettings, InitSettingsSource, PydanticBaseSett
 from common.config_help import Setting, format_help, settings_of
 
 ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
-SECTIONS: Final = ("generator", "actor", "learner", "evaluator", "local", "play", "pictures", "report")
+SECTIONS: Final = (
+    "generator",
+    "actor",
+    "learner",
+    "evaluator",
+    "local",
+    "play",
+    "pictures",
+    "report",
+    "ship",
+)
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

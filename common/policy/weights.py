@@ -186,6 +186,16 @@ class Policy:
         return actions
 
 
+def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
+    """Write the two files of a policy into ``folder``, which nobody reads yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors: dict[str, npt.NDArray[Any]] = dict(state_tensors(network))
+    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean, moments.var
+    tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
+    (folder / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
+    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+
+
 def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
     """Write a policy folder; whoever reads it sees the old one or the new one, never a mixture.
 
@@ -195,11 +205,7 @@ def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: 
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     fresh.chmod(0o755)
-    tensors: dict[str, npt.NDArray[Any]] = dict(state_tensors(network))
-    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean, moments.var
-    tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
-    (fresh / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
-    (fresh / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+    write_policy(fresh, network, moments, contract)
     for path in fresh.iterdir():
         with path.open("rb") as file:
             os.fsync(file.fileno())

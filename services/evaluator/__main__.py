@@ -1,6 +1,6 @@
 """Run the evaluator: `python -m services.evaluator`; with --policy it plays once and ends.
 
-`play`, `pictures` and `report` as first argument are commands of their own, with their own --help.
+`play`, `pictures`, `report` and `ship` as first argument are commands of their own, with their own --help.
 """
 
 import os
@@ -16,7 +16,7 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, run_service
 from common.service_config import new_incarnation
-from services.evaluator import once, pictures, play
+from services.evaluator import once, pictures, play, ship
 from services.evaluator.config import EvaluatorConfig
 from services.evaluator.report import command as report
 from services.evaluator.service import EvaluatorService
@@ -28,6 +28,7 @@ SUBCOMMANDS: Final[dict[str, Callable[[Sequence[str], Event], int]]] = {
     "play": play.main,
     "pictures": pictures.main,
     "report": report.main,
+    "ship": ship.main,
 }
 
 
