@@ -55,7 +55,7 @@ class EnvConfig(BaseModel):
         0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally"
     )
     foresee: float = Field(
-        0.0,
+        0.8,
         ge=0,
         le=1,
         description="share of episodes that end once the ball is hit: its flight home is computed and paid at once",
@@ -192,6 +192,8 @@ class RallyEnv:
             transitions=transition_table(),
             rewards=np.ascontiguousarray(self._rewards[stage - 1]),
             landing_scale=config.reward.landing_scale,
+            heading=config.reward.heading if stage == 3 else 0.0,
+            heading_scale=config.reward.heading_scale,
             rate_scale=config.reward.reference_rate_hz / config.control_rate_hz,
             torque_weight=config.reward.torque,
             torque_limit=self.robot.torque_limit,

@@ -82,12 +82,12 @@ def offsets(layout: tuple[Part, ...]) -> dict[str, slice]:
 
 
 class ObservationConfig(BaseModel):
-    """What policy and critic see; the policy's default is the paper's 37 numbers."""
+    """What policy and critic see; the paper's is 37 numbers for both."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     history: int = Field(
-        0, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
+        6, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
     )
     spin: bool = Field(
         False, description="tell the policy the ball's true spin: a ceiling, nothing for a robot"
@@ -98,7 +98,7 @@ class ObservationConfig(BaseModel):
     )
 
 
-PAPER_OBSERVATION = ObservationConfig(critic="policy")
+PAPER_OBSERVATION = ObservationConfig(history=0, critic="policy")
 """The paper's: 37 numbers for policy and critic alike."""
 
 

@@ -19,7 +19,8 @@ from common.physics.arm import (
     racket_quaternion,
     speed_bound,
 )
-from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP
+from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP, NET_HEIGHT
+from common.physics.flight import flight_step
 from common.physics.fly import fly_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
@@ -37,7 +38,7 @@ SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0
 CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
-_LONGEST_FLIGHT = 3.0  # [s] of a ball that was hit, to the floor at the latest
+_LONGEST_FLIGHT_STEPS = 600  # grid steps of a ball that was hit, to the floor at the latest
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -54,6 +55,7 @@ class Rallies(NamedTuple):
     condition: Array  # (B, 14) noise.Condition
     clock: Integers  # (B,) grid steps since launch
     rounds_left: Integers  # (B,) rallies left in this episode, the one in play included
+    aimed: npt.NDArray[np.bool_]  # (B,) the bonus for where the hit ball is heading has been paid
     foreseen: npt.NDArray[
         np.bool_
     ]  # (B,) once hit, the ball's flight is flown to its end at once, robot apart
@@ -84,6 +86,8 @@ class Rules(NamedTuple):
     transitions: Integers  # trajectory.transition_table()
     rewards: Array  # (8, 5) reward.reward_table()[stage - 1]
     landing_scale: float  # [m]
+    heading: float  # weight of the bonus for where a hit ball is heading; 0 in stages that don't aim
+    heading_scale: float  # [m]
     rate_scale: float  # reference rate / control rate: continuous rows, torque and collision are rates (jitter is not)
     torque_weight: float
     torque_limit: Array  # (7,) [N, Nm]
@@ -126,6 +130,7 @@ def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
         condition=np.zeros((count, CONDITIONS)),
         clock=np.zeros(count, np.int64),
         rounds_left=np.ones(count, np.int64),
+        aimed=np.zeros(count, np.bool_),
         foreseen=np.zeros(count, np.bool_),
         caught=np.zeros(count, np.bool_),
         over=np.zeros(count, np.bool_),
@@ -192,6 +197,7 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
     rallies.clock[b] = 0
     rallies.caught[b] = False
     rallies.over[b] = False
+    rallies.aimed[b] = False
     rallies.landing[b, 0], rallies.landing[b, 1] = np.nan, np.nan
     rallies.landing_error[b] = np.nan
     rallies.head[b] = 0
@@ -332,6 +338,35 @@ def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array
 
 
 @kernel
+def heading(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, bool]:
+    """Return where a ball is heading: where it would come down to the table's height, were nothing in its way.
+
+    Args:
+        pos: Position [m] right after the hit.
+        vel: Velocity [m/s].
+        spin: Spin [rad/s].
+        condition: The rally's ``noise.Condition`` (14,).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+
+    Returns:
+        x and y there [m], and whether the ball clears the net's height on its way.
+    """
+    clears = False
+    for _ in range(_LONGEST_FLIGHT_STEPS):
+        before = pos
+        pos, vel = flight_step(pos, vel, spin, GRID_STEP, condition[0], condition[1], model)
+        if before[0] < 0.0 <= pos[0]:
+            clears = min(before[2], pos[2]) > NET_HEIGHT + BALL_RADIUS
+        if pos[2] < BALL_RADIUS and vel[2] < 0.0:
+            if before[2] <= BALL_RADIUS:
+                break  # hit below the table's height, and never above it
+            share = (before[2] - BALL_RADIUS) / (before[2] - pos[2])
+            x, y = before[0] + share * (pos[0] - before[0]), before[1] + share * (pos[1] - before[1])
+            return x, y, clears
+    return pos[0], pos[1], clears
+
+
+@kernel
 def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Array) -> tuple[Flown, float]:
     """Fly a ball that was hit to the rally's end at once, as if the robot were not there.
 
@@ -368,7 +403,7 @@ def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Arra
         if outcome == 0 and steps % rules.grid_steps == 0:
             near = norm(sub(pos, target))
             aim += 1.0 / ((1.0 + near * near) * (1.0 + near * near))
-        if steps * GRID_STEP > _LONGEST_FLIGHT:
+        if steps >= _LONGEST_FLIGHT_STEPS:
             outcome = _TIME_OUT
     return Flown(pos, vel, spin, state, outcome, False, False, landed, 0.0), aim
 
@@ -391,7 +426,12 @@ def settle(
     """
     substeps = motion.joint_pos.shape[1]
     ball, condition = rallies.ball[b], rallies.condition[b]
-    later_aim = 0.0
+    later_aim, bonus = 0.0, 0.0
+    if rules.heading > 0.0 and flown.state == _TAU_23 and flown.outcome == 0 and not rallies.aimed[b]:
+        rallies.aimed[b] = True
+        x, y, clears = heading(flown.pos, flown.vel, flown.spin, condition, rules.flight_model)
+        off2 = ((x - condition[8]) ** 2 + (y - condition[9]) ** 2) / rules.heading_scale**2
+        bonus = (1.0 if clears else 0.5) * rules.heading / (1.0 + off2)
     if rallies.foreseen[b] and flown.state == _TAU_23 and flown.outcome == 0:
         flown, later_aim = foresee(rallies, b, flown, rules, path[:0])
     pos, vel, spin, state, outcome, bounced, hit, landed, racket_speed = flown
@@ -414,7 +454,7 @@ def settle(
     if not (bounced or hit or landed or state == _TAU_0):
         terms[0] = rules.rate_scale * rows[state, 1] * g
         terms[3] = rules.rate_scale * rows[state, 3] * aim
-    terms[3] += rules.rate_scale * rows[_TAU_23, 3] * later_aim
+    terms[3] += rules.rate_scale * rows[_TAU_23, 3] * later_aim + bonus
     torque, jitter, collision = 0.0, 0.0, 0.0
     for j in range(7):
         change = actions[b, j] - rallies.last_action[b, j]

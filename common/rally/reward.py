@@ -60,11 +60,22 @@ class RewardConfig(BaseModel):
         0.1, ge=0, le=10, description="e: weight of sum min(F_c/50 N, 1)", json_schema_extra={"unit": "-"}
     )
     landing_scale: float = Field(
-        1.0,
+        0.5,
         gt=0,
         le=10,
         description="length scale s of the landing reward; the paper's is 1",
         json_schema_extra={"unit": "m"},
+    )
+    heading: float = Field(
+        100.0,
+        ge=0,
+        le=1000,
+        description="stage 3: bonus right after the contact, w/(1 + (e/s)^2), e from the target to where the ball is "
+        "heading; half of it if that is the net. The paper's is 0",
+        json_schema_extra={"unit": "-"},
+    )
+    heading_scale: float = Field(
+        0.5, gt=0, le=10, description="its length scale s", json_schema_extra={"unit": "m"}
     )
     stage_2_landing: float = Field(
         0.0,

@@ -12,9 +12,9 @@ class CurriculumConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    stage_1: int = Field(183, ge=0, description="epochs of stage 1, catching (3 M frames of 16,384 an epoch)")
-    stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (2 M frames)")
-    stage_3: int = Field(2136, ge=0, description="epochs of stage 3, aiming (35 M frames)")
+    stage_1: int = Field(244, ge=0, description="epochs of stage 1, catching (2 M frames of 8,192 an epoch)")
+    stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (1 M frames)")
+    stage_3: int = Field(14282, ge=0, description="epochs of stage 3, aiming (117 M frames)")
     first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
     catch_gate: float = Field(
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"

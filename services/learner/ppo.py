@@ -33,11 +33,11 @@ class PPOConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     gamma: float = Field(0.99, gt=0, lt=1, description="discount per control step")
-    gae_lambda: float = Field(0.95, ge=0, le=1, description="trace decay of the advantage")
+    gae_lambda: float = Field(0.9, ge=0, le=1, description="trace decay of the advantage")
     clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
     mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
     minibatch: int = Field(
-        4096, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
+        2048, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
     )
     reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
     value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
@@ -45,15 +45,17 @@ class PPOConfig(BaseModel):
     bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
     gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
     learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
-    learning_rate_min: float = Field(1e-4, gt=0, le=0.1, description="lower bound of the adaptation")
+    learning_rate_min: float = Field(2e-5, gt=0, le=0.1, description="lower bound of the adaptation")
     learning_rate_max: float = Field(
         1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage"
     )
     target_kl: float = Field(
         0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to"
     )
-    precision: Literal["float32", "bfloat16"] = Field(
-        "float32", description="of the update's matrix products; weights, losses and Adam are float32 always"
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
+        "CPU multiplies it natively",
     )
     refit_epochs: int = Field(
         24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
@@ -96,6 +98,9 @@ class UpdateStats:
 
 def arithmetic(precision: str) -> torch.autocast:
     """Return the context in which the network's products are computed in ``precision``."""
+    if precision == "auto":
+        can = torch.cpu.get_capabilities()
+        precision = "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
     return torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16")
 
 
