@@ -205,7 +205,8 @@ def final_measures(folder: RunFolder, config: DeployConfig, stop: Event) -> dict
             f"the final evaluation ended with status {status}: {family.last_line(spec.name)}"
         )
     measured: dict[str, Any] = json.loads(family.last_line(spec.name))
-    measured.pop("policy")
+    for detail in ("policy", "by", "by_round"):
+        measured.pop(detail, None)
     measured["evaluation_seconds"] = measured.pop("seconds")
     return measured
 

@@ -61,6 +61,11 @@ class RallyRequest:
     block: Count
 
 
+AVERAGE = b"average"
+"""Asked with this payload, the policy's queryable answers with the running mean of the weights; with none, with the
+newest weights."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PolicySnapshot:
     """All that an actor needs to play one version of the policy, in one blob."""

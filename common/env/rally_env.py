@@ -277,7 +277,14 @@ class RallyEnv:
         options, robot = self.config.observation, self.robot
         is_privileged = options.critic == "privileged"
         play.observe(
-            self._rallies, rows, robot.joint_pos, robot.joint_vel, options.spin, is_privileged, self._obs
+            self._rallies,
+            rows,
+            robot.joint_pos,
+            robot.joint_vel,
+            options.spin,
+            is_privileged,
+            self._flight_model,
+            self._obs,
         )
 
     def _finish(self, rows: Rows) -> FinishedRallies:

@@ -19,14 +19,14 @@ from common.physics.arm import (
     racket_quaternion,
     speed_bound,
 )
-from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP, NET_HEIGHT
-from common.physics.flight import flight_step
+from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP
 from common.physics.fly import fly_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.draws import Stream, normal_pair, uniform
+from common.rally.heading import LONGEST_FLIGHT, LOOK_AHEAD, foresight, heading
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
@@ -38,7 +38,6 @@ SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0
 CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
-_LONGEST_FLIGHT_STEPS = 600  # grid steps of a ball that was hit, to the floor at the latest
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -338,35 +337,6 @@ def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array
 
 
 @kernel
-def heading(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, bool]:
-    """Return where a ball is heading: where it would come down to the table's height, were nothing in its way.
-
-    Args:
-        pos: Position [m] right after the hit.
-        vel: Velocity [m/s].
-        spin: Spin [rad/s].
-        condition: The rally's ``noise.Condition`` (14,).
-        model: ``flight.SIMPLE`` or ``flight.FULL``.
-
-    Returns:
-        x and y there [m], and whether the ball clears the net's height on its way.
-    """
-    clears = False
-    for _ in range(_LONGEST_FLIGHT_STEPS):
-        before = pos
-        pos, vel = flight_step(pos, vel, spin, GRID_STEP, condition[0], condition[1], model)
-        if before[0] < 0.0 <= pos[0]:
-            clears = min(before[2], pos[2]) > NET_HEIGHT + BALL_RADIUS
-        if pos[2] < BALL_RADIUS and vel[2] < 0.0:
-            if before[2] <= BALL_RADIUS:
-                break  # hit below the table's height, and never above it
-            share = (before[2] - BALL_RADIUS) / (before[2] - pos[2])
-            x, y = before[0] + share * (pos[0] - before[0]), before[1] + share * (pos[1] - before[1])
-            return x, y, clears
-    return pos[0], pos[1], clears
-
-
-@kernel
 def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Array) -> tuple[Flown, float]:
     """Fly a ball that was hit to the rally's end at once, as if the robot were not there.
 
@@ -403,7 +373,7 @@ def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Arra
         if outcome == 0 and steps % rules.grid_steps == 0:
             near = norm(sub(pos, target))
             aim += 1.0 / ((1.0 + near * near) * (1.0 + near * near))
-        if steps >= _LONGEST_FLIGHT_STEPS:
+        if steps * GRID_STEP >= LONGEST_FLIGHT:
             outcome = _TIME_OUT
     return Flown(pos, vel, spin, state, outcome, False, False, landed, 0.0), aim
 
@@ -429,9 +399,9 @@ def settle(
     later_aim, bonus = 0.0, 0.0
     if rules.heading > 0.0 and flown.state == _TAU_23 and flown.outcome == 0 and not rallies.aimed[b]:
         rallies.aimed[b] = True
-        x, y, clears = heading(flown.pos, flown.vel, flown.spin, condition, rules.flight_model)
+        x, y, over_net = heading(flown.pos, flown.vel, flown.spin, condition, rules.flight_model, GRID_STEP)
         off2 = ((x - condition[8]) ** 2 + (y - condition[9]) ** 2) / rules.heading_scale**2
-        bonus = (1.0 if clears else 0.5) * rules.heading / (1.0 + off2)
+        bonus = (1.0 if over_net > 0.0 else 0.5) * rules.heading / (1.0 + off2)
     if rallies.foreseen[b] and flown.state == _TAU_23 and flown.outcome == 0:
         flown, later_aim = foresee(rallies, b, flown, rules, path[:0])
     pos, vel, spin, state, outcome, bounced, hit, landed, racket_speed = flown
@@ -513,6 +483,7 @@ def observe(
     joint_vel: Array,
     spin: bool,
     privileged: bool,
+    model: int,
     out: npt.NDArray[np.float32],
 ) -> None:
     """Write ``observation.critic_layout`` of ``rows`` (n,) into the same rows of ``out`` (B, D).
@@ -524,6 +495,7 @@ def observe(
         joint_vel: Joint velocities now (B, 7).
         spin: Whether the policy is told the true spin.
         privileged: Whether the critic's truth follows.
+        model: ``flight.SIMPLE`` or ``flight.FULL``: what the critic's foresight goes by.
         out: Rows to write.
     """
     for k in range(rows.shape[0]):
@@ -561,3 +533,20 @@ def observe(
                 o[at + j] = rallies.ball[b, j]
             for j in range(8):  # drag, lift, table, rubber
                 o[at + 9 + j] = rallies.condition[b, j]
+            if rallies.state[b] in (_TAU_1, _TAU_12):
+                ball = rallies.ball[b]
+                seen = foresight(
+                    (ball[0], ball[1], ball[2]),
+                    (ball[3], ball[4], ball[5]),
+                    (ball[6], ball[7], ball[8]),
+                    rallies.condition[b],
+                    joints,
+                    rates,
+                    model,
+                )
+                o[at + 17], o[at + 18], o[at + 19], o[at + 20] = seen.meets, seen.time, seen.side, seen.up
+                o[at + 21], o[at + 22], o[at + 23] = seen.miss_x, seen.miss_y, seen.over_net
+            else:
+                o[at + 17], o[at + 18] = 0.0, LOOK_AHEAD
+                for j in range(5):
+                    o[at + 19 + j] = 0.0

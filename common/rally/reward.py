@@ -86,6 +86,10 @@ class RewardConfig(BaseModel):
     )
 
 
+PAPER_REWARD = RewardConfig(landing_scale=1.0, heading=0.0)
+"""The paper's: R and e_r, and nothing besides."""
+
+
 def reward_table(config: RewardConfig) -> npt.NDArray[np.float64]:
     """Return R for the kernels: [stage - 1, state, feature], (3, 8, 5)."""
     table = np.array([[R[state][stage] for state in State] for stage in range(3)])

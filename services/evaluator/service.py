@@ -9,8 +9,8 @@ from typing import Any
 
 from common.comms.codec import DecodeError, decode, decode_one_of, encode
 from common.comms.keys import Keys
-from common.comms.messages import Command, Control, ControlReply, PolicySnapshot, Status
-from common.comms.transport import Flow, Reply, Transport
+from common.comms.messages import AVERAGE, Command, Control, ControlReply, PolicySnapshot, Status
+from common.comms.transport import Flow, PendingReply, Reply, Transport
 from common.metrics import Metrics
 from common.policy.weights import (
     Contract,
@@ -31,6 +31,7 @@ from services.evaluator.measures import measures
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.2
+ANSWER_S = 5.0  # for the learner to answer with the policy
 CURVE_FILE = "evaluations.csv"
 CURVE = (
     "version",
@@ -86,7 +87,6 @@ class EvaluatorService:
         self._network = new_network(config.network, config.env.observation)
         self._incarnation = incarnation
         self._keys = keys = Keys(config.run)
-        self._policies = transport.subscribe(keys.policy(), capacity=1)
         self._control = transport.serve(keys.ctl("evaluator", config.id), capacity=16)
         self._alive = transport.declare_alive(keys.alive("evaluator", config.id, incarnation))
         self._folder = RunFolder.of(config.run, config.folder)
@@ -94,14 +94,13 @@ class EvaluatorService:
         self._rallies = evaluation_rallies(
             config.rallies, config.launch, config.noise, config.seed, config.env.flight
         )
-        self._snapshot: PolicySnapshot | None = None
         self._played = (-1, -1)
         self._best = self._best_so_far()
         self._stop = Event()
         self._born = clock()
         self._next_play = self._born
         self._next_status = 0.0
-        self._asked = transport.request(keys.policy(), b"", 5.0, Flow.POLICY)
+        self._asked: PendingReply | None = None
         self._last: dict[str, float] = {}
         self._stopping = False
         self.evaluations = 0
@@ -119,24 +118,23 @@ class EvaluatorService:
         self._alive.close()
 
     def step(self) -> None:
-        """Take policies in, and evaluate the newest one if it is time."""
+        """Ask for the policy if it is time, and evaluate it once it has come."""
         self._obey()
-        for sample in self._policies.poll():
-            self._take(sample.payload)
-        outcome = self._asked.poll()
-        if self._snapshot is None and outcome is not None:
-            if isinstance(outcome, Reply):
-                self._take(outcome.payload)
-            else:
-                self._asked = self._transport.request(self._keys.policy(), b"", 5.0, Flow.POLICY)
         now = self._clock()
-        snapshot = self._snapshot
-        if snapshot and now >= self._next_play and (snapshot.generation, snapshot.version) != self._played:
-            self._played = (snapshot.generation, snapshot.version)
-            self.state = "playing"
-            self._evaluate(snapshot)
-            self._next_play = self._clock() + self._config.interval_s
-            self.state = "waiting"
+        if self._asked is None and now >= self._next_play:
+            # The running mean of the weights, which nobody plays while training: so it isn't broadcast, but asked for.
+            self._asked = self._transport.request(self._keys.policy(), AVERAGE, ANSWER_S, Flow.POLICY)
+        outcome = self._asked.poll() if self._asked else None
+        if outcome is not None:
+            self._asked = None
+            self._next_play = now + IDLE_WAIT_S
+            snapshot = self._read(outcome.payload) if isinstance(outcome, Reply) else None
+            if snapshot and (snapshot.generation, snapshot.version) != self._played:
+                self._played = (snapshot.generation, snapshot.version)
+                self.state = "playing"
+                self._evaluate(snapshot)
+                self._next_play = self._clock() + self._config.interval_s
+                self.state = "waiting"
         self._beat()
 
     def _beat(self) -> None:
@@ -173,15 +171,12 @@ class EvaluatorService:
             self._stopping |= command in (Command.STOP, Command.DRAIN)
             request.reply(encode(ControlReply(True, self.state, "")))
 
-    def _take(self, payload: bytes) -> None:
+    def _read(self, payload: bytes) -> PolicySnapshot | None:
         try:
-            snapshot = decode(payload, PolicySnapshot)
+            return decode(payload, PolicySnapshot)
         except DecodeError as error:
             self._refused("policy", error)
-            return
-        mine = self._snapshot
-        if mine is None or (snapshot.generation, snapshot.version) > (mine.generation, mine.version):
-            self._snapshot = snapshot
+            return None
 
     def _refused(self, kind: str, reason: object) -> None:
         self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
@@ -196,10 +191,6 @@ class EvaluatorService:
             )
         except PolicyError as error:
             self._refused("policy", error)
-            self._snapshot, self._played = (
-                None,
-                (-1, -1),
-            )  # however high its version: the next good one counts
             return
         contract = self._contract(snapshot)
         policy = Policy(self._network, moments, contract)

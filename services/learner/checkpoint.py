@@ -27,7 +27,7 @@ SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
 GOOD = "good"  # folder beside them: the last one from which training went well
 
-_NETWORK, _ADAM = "network.", "adam."
+_NETWORK, _AVERAGE, _ADAM = "network.", "average.", "adam."
 _MOMENTS = ("obs_moments", "value_moments")
 
 
@@ -51,6 +51,7 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     tensors: dict[str, npt.NDArray[Any]] = {
         _NETWORK + name: value for name, value in state_tensors(training.network).items()
     }
+    tensors |= {_AVERAGE + name: value for name, value in state_tensors(training.average).items()}
     names = [name for name, _ in training.network.named_parameters()]
     state = training.optimizer.state_dict()["state"]
     for index, name in enumerate(names):
@@ -109,6 +110,7 @@ def restore(path: Path, training: Training) -> Extras:
         raise CheckpointError(f"checkpoint {path} has format {about.get('format')!r}; allowed is {FORMAT}")
     try:
         load_state(training.network, _under(_NETWORK, tensors))
+        load_state(training.average, _under(_AVERAGE, tensors) or _under(_NETWORK, tensors))
         training.optimizer.load_state_dict(_adam_state(training, _under(_ADAM, tensors)))
         for which in _MOMENTS:
             mean, var, count = (tensors[f"{which}.{part}"] for part in ("mean", "var", "count"))

@@ -10,6 +10,7 @@ from threading import Event
 from common.comms.codec import DecodeError, decode_one_of, encode
 from common.comms.keys import Keys
 from common.comms.messages import (
+    AVERAGE,
     ActorReport,
     Command,
     Control,
@@ -25,6 +26,7 @@ from common.config import to_toml
 from common.env.robot import home_action
 from common.errors import ReportedError
 from common.metrics import Metrics
+from common.policy.actor_critic import ActorCritic
 from common.policy.weights import Contract, contract_of, pack, save_policy, task_hash
 from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
@@ -119,7 +121,7 @@ class LearnerService:
         self._token = transport.declare_alive(keys.alive("learner", LEARNER_ID, self._generation))
         self._paused = self._stopping = False
         self._warned = False
-        self._blob = b""
+        self._blob = self._average = b""
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         self.state = "waiting"
         self._publish_policy()
@@ -213,7 +215,7 @@ class LearnerService:
         if self.training.progress.health.is_good:
             checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
         save_policy(
-            self._folder.latest_policy, self.training.network, self.training.obs_moments, self._contract()
+            self._folder.latest_policy, self.training.average, self.training.obs_moments, self._contract()
         )
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
         log.debug("checkpoint written file=%s", path)
@@ -310,9 +312,10 @@ class LearnerService:
 
     # ---- talking
 
-    def _publish_policy(self) -> None:
+    def _snapshot(self, network: ActorCritic) -> bytes:
+        """Return the newest version with the weights of ``network``, encoded."""
         training, progress = self.training, self.training.progress
-        self._blob = encode(
+        return encode(
             PolicySnapshot(
                 run=self._config.run,
                 generation=self._generation,
@@ -322,7 +325,7 @@ class LearnerService:
                 epoch=progress.epoch,
                 frames=progress.frames,
                 contract_hash=self._contract_hash,
-                weights=pack(training.network),
+                weights=pack(network),
                 obs_mean=training.obs_moments.mean,
                 obs_var=training.obs_moments.var,
                 obs_count=training.obs_moments.count,
@@ -331,7 +334,17 @@ class LearnerService:
                 value_count=training.value_moments.count,
             )
         )
+
+    def _publish_policy(self) -> None:
+        self._blob = self._snapshot(self.training.network)
+        self._average = b""  # made when somebody asks
         self._transport.publish(self._keys.policy(), self._blob, Flow.POLICY)
+
+    def _averaged(self) -> bytes:
+        """Return the newest version with the running mean of the weights."""
+        if not self._average:
+            self._average = self._snapshot(self.training.average)
+        return self._average
 
     def _serve(self) -> None:
         """Answer what waits; also between gradient steps, so that no actor waits for an update."""
@@ -380,7 +393,7 @@ class LearnerService:
             self._stopping |= message.command in (Command.STOP, Command.DRAIN)
             request.reply(encode(ControlReply(True, self.state, "")))
         while (request := self._policies.poll()) is not None:
-            request.reply(self._blob)
+            request.reply(self._averaged() if request.payload == AVERAGE else self._blob)
         while (request := self._stage_log.poll()) is not None:
             request.reply(encode(StageLog(tuple(self._stages))))
 

@@ -1,5 +1,6 @@
 """The learner's state and one epoch of it: datasets in, updates out. No clock, no network, no files."""
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -28,6 +29,7 @@ from services.learner.ppo import (
 
 Floats = npt.NDArray[np.float32]
 
+AVERAGE_DECAY = 0.99  # of the weights' running mean, a dataset: it looks back over some 0.8 M frames
 CATCH_WINDOW = 0.2  # weight of the newest epoch in the running catch rate that gates look at
 
 
@@ -128,6 +130,9 @@ class Training:
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.network: ActorCritic = new_network(network, observation, home_action)
+        # Every dataset moves the weights by its noise as well as by what it says; their mean plays better (Polyak and
+        # Juditsky 1992; Hilton et al. 2022 average a policy likewise). It is what gets measured and kept.
+        self.average: ActorCritic = copy.deepcopy(self.network)
         self.network_config = network
         self.obs_size = size(critic_layout(observation))
         self.ppo = ppo
@@ -194,7 +199,9 @@ class Training:
         if before.stage_number > 0:
             # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset: the
             # network must not play differently for it.
-            self.network.renormalize(frozen, self.obs_moments)
+            for network in (self.network, self.average):
+                network.renormalize(frozen, self.obs_moments)
+        self._follow()
         play = play_stats(rollouts)
         frames = sum(r.rewards.size for r in rollouts)
         caught = play.caught / play.rallies if play.rallies else before.catch_rate
@@ -231,6 +238,13 @@ class Training:
         lag = float(np.mean([before.version - r.version for r in rollouts]))
         diverged = divergence(health, finite, self.guard)
         return EpochStats(self.progress, stats, play, changed, diverged, lag, frames)
+
+    @torch.no_grad()
+    def _follow(self) -> None:
+        """Let the running mean of the weights take in the newest; a young mean forgets its start faster."""
+        weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
+        for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(newest, weight)
 
     def go_back(self, load: Callable[["Training"], object]) -> None:
         """Take network, optimiser and moments from an earlier moment of this run; time doesn't go back.

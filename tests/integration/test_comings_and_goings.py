@@ -253,3 +253,21 @@ def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
 
     assert score(kept) >= score(best)
     assert again.service._best is not None
+
+
+def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):
+    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=0.2) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        good = tmp_path / "checkpoints" / "good"
+        wait_until(lambda: good.exists() and any(good.iterdir()), 60, "a good checkpoint")
+        with torch.no_grad():
+            learner.service.training.network.mean.weight[:] = float("nan")
+        wait_until(lambda: learner.metric("topspin_rollbacks_total") == 1, 30, "a way back")
+        version = progress(learner).version
+        wait_until(lambda: progress(learner).version > version + 2, 30, "epochs after it")
+        weights = learner.service.training.network.mean.weight
+
+    assert progress(learner).rollbacks == 1
+    assert bool(weights.isfinite().all())

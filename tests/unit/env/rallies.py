@@ -6,7 +6,7 @@ import numpy.typing as npt
 from common.env.rally_env import EnvConfig, Launches, RallyEnv
 from common.rally.launch import RallyBlock, draw_rallies
 
-QUIET = EnvConfig(noise="off", carry_over=0.0, go_on=0.0, reset_spread=0.0)
+QUIET = EnvConfig(noise="off", carry_over=0.0, go_on=0.0, reset_spread=0.0, foresee=0.0)
 """No noise, and every episode begins at home."""
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from common.physics.flight import SIMPLE
 from common.rally import play
 from common.rally.noise import PROFILES, NoiseProfile
-from common.rally.reward import RewardConfig, reward_table
+from common.rally.reward import PAPER_REWARD, RewardConfig, reward_table
 from common.rally.trajectory import Outcome, State, transition_table
 
 Array = npt.NDArray[np.float64]
@@ -43,13 +43,14 @@ class Played:
 
 
 def make_rules(
-    stage: int = 1, rate_scale: float = 1.0, time_limit: float = 2.5, reward: RewardConfig | None = None
+    stage: int = 1, rate_scale: float = 1.0, time_limit: float = 2.5, reward: RewardConfig = PAPER_REWARD
 ) -> play.Rules:
-    reward = reward or RewardConfig()
     return play.Rules(
         transitions=transition_table(),
         rewards=np.ascontiguousarray(reward_table(reward)[stage - 1]),
         landing_scale=reward.landing_scale,
+        heading=reward.heading if stage == 3 else 0.0,
+        heading_scale=reward.heading_scale,
         rate_scale=rate_scale,
         torque_weight=reward.torque,
         torque_limit=TORQUE_LIMIT,
@@ -115,6 +116,7 @@ def play_ball(
     seed: int = 1,
     noise: NoiseProfile = PROFILES["off"],
     steps: int = 150,
+    foreseen: bool = False,
 ) -> Played:
     """Play a ball until its rally ends, for at most ``steps`` control steps.
 
@@ -132,9 +134,11 @@ def play_ball(
         seed: Of the rally.
         noise: Profile.
         steps: Longest play.
+        foreseen: Whether a hit ball is flown to its end at once.
     """
     rules = rules or make_rules()
     rallies, step = begin(make_record(pos, vel, spin, drag, lift), state, target, seed, noise)
+    rallies.foreseen[0] = foreseen
     states, balls, seen, terms, rewards, impulses = [], [], [], [], [], []
     for k in range(steps):
         before, after = (np.array(joints) + t * CONTROL_PERIOD * np.array(rates) for t in (k, k + 1))

@@ -199,3 +199,70 @@ def test_on_its_way_back_the_ball_pays_by_its_distance_to_the_target_in_space():
     d_bt = np.sqrt(0.4**2 + 0.3**2 + (height - 0.02) ** 2)
 
     assert played.terms[0, TERMS.index("aim")] == pytest.approx(1.0 / (1.0 + d_bt**2) ** 2)
+
+
+HEADING = RewardConfig(landing_scale=1.0, heading=100.0, heading_scale=0.5)
+
+
+@pytest.mark.parametrize(
+    ("what", "pos", "vel", "share"),
+    [
+        ("down on the court behind the net", (-1.0, 0.1, 0.3), (3.0, 0.5, 2.0), 1.0),
+        ("into the net, and would come down behind it", (-1.0, 0.1, 0.1), (5.0, 0.5, 0.8), 0.5),
+        ("past the table", (-1.0, 0.1, 0.3), (7.0, 0.5, 2.0), 1.0),
+    ],
+)
+def test_a_hit_ball_pays_for_where_a_parabola_would_bring_it_down(what, pos, vel, share):
+    target = (0.7, 0.2)
+    played = play_ball(pos, vel, state=State.TAU_23, target=target, rules=make_rules(stage=3, reward=HEADING))
+    plain = play_ball(pos, vel, state=State.TAU_23, target=target, rules=make_rules(stage=3))
+
+    # The bonus is paid at the end of the first control step, for the ball as it is then: on the same parabola.
+    fall = (vel[2] + np.sqrt(vel[2] ** 2 + 2 * 9.81 * (pos[2] - 0.02))) / 9.81
+    e2 = (pos[0] + vel[0] * fall - target[0]) ** 2 + (pos[1] + vel[1] * fall - target[1]) ** 2
+    bonus = played.terms[:, TERMS.index("aim")] - plain.terms[:, TERMS.index("aim")]
+    assert bonus[0] == pytest.approx(share * 100.0 / (1.0 + e2 / 0.25), rel=1e-3), what
+    np.testing.assert_array_equal(bonus[1:], 0.0)
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_where_a_ball_is_heading_pays_in_stage_3_alone(stage):
+    played = play_ball(
+        (-1, 0, 0.3), (3, 0, 2), state=State.TAU_23, rules=make_rules(stage=stage, reward=HEADING)
+    )
+
+    np.testing.assert_array_equal(played.terms[:, TERMS.index("aim")], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("pos", "vel", "spin", "outcome"),
+    [
+        ((-1.0, 0.1, 0.3), (3.0, 0.5, 2.0), (0, 90, 20), Outcome.RETURNED),
+        ((-1.0, 0.1, 0.1), (5.0, 0.5, 0.5), (0, -60, 0), Outcome.NET),
+        ((-1.0, 0.1, 0.3), (8.0, 0.5, 2.0), (0, 0, 50), Outcome.OUT),
+        ((-1.0, 0.1, 0.3), (1.0, 0.0, 0.0), (0, 0, 0), Outcome.OWN_COURT),
+    ],
+)
+def test_a_foreseen_flight_ends_as_the_flight_itself_and_pays_the_same(pos, vel, spin, outcome):
+    """The arm is far away: played or foreseen, it is the same ball, to the bit."""
+    options = {"state": State.TAU_23, "drag": 1.1, "lift": 0.9, "target": (0.7, 0.2)}
+    played = play_ball(pos, vel, spin, rules=make_rules(stage=3, reward=HEADING), **options)
+    foreseen = play_ball(pos, vel, spin, rules=make_rules(stage=3, reward=HEADING), foreseen=True, **options)
+
+    assert played.outcome == foreseen.outcome == outcome
+    assert len(foreseen.rewards) == 1 < len(played.rewards)
+    assert foreseen.over == played.over
+    np.testing.assert_array_equal(foreseen.landing_error, played.landing_error)
+    for term in ("aim", "landing"):
+        k = TERMS.index(term)
+        # The dense row is paid at the end of a control step; the step in which the flight ends may differ.
+        assert foreseen.terms[:, k].sum() == pytest.approx(
+            played.terms[:, k].sum(), abs=1.0 if term == "aim" else 1e-9
+        )
+
+
+def test_what_is_not_yet_hit_is_not_foreseen():
+    played = play_ball((0.7, 0, 0.6), (-3, 0, 0), foreseen=True)
+
+    assert State.TAU_12 in played.states
+    assert played.outcome != Outcome.RETURNED

@@ -1,0 +1,122 @@
+"""Divergence: believed after patience, never of a stage that has learned nothing, and what going back keeps."""
+
+import numpy as np
+import pytest
+import torch
+
+from common.policy.actor_critic import NetworkConfig
+from services.learner import checkpoint
+from services.learner.checkpoint import Extras, keep, restore, save
+from services.learner.curriculum import CurriculumConfig
+from services.learner.guard import GuardConfig, Health, divergence, watched
+from services.learner.ppo import PPOConfig
+from services.learner.training import Training
+from tests.unit.learner.rollouts import make_rollout
+
+GUARD = GuardConfig(collapse=0.5, least=0.2, patience=5)
+EXTRAS = Extras(run="r", generation=7, stage_log=[], memory=[], trained_seconds=1.5)
+
+
+def history(rates, config=GUARD):
+    health = Health()
+    for rate in rates:
+        health = watched(health, rate, config)
+    return health
+
+
+def make_training(guard=GUARD):
+    return Training(
+        PPOConfig(minibatch=64, mini_epochs=2),
+        NetworkConfig(units=(16, 8)),
+        CurriculumConfig(stage_1=50),
+        np.zeros(7, np.float32),
+        0,
+        guard=guard,
+    )
+
+
+def test_a_rate_that_collapses_and_stays_low_is_a_divergence():
+    assert divergence(history([0.8] * 30 + [0.1] * 30), True, GUARD).startswith("rate 0.1")
+
+
+@pytest.mark.parametrize(
+    ("what", "rates"),
+    [
+        ("a dip that recovers", [0.8] * 30 + [0.0] * 4 + [0.8] * 30),
+        ("noise", [0.8, 0.6] * 30),
+        ("a start that has learned nothing", [0.15] * 30 + [0.01] * 30),
+        ("datasets in which no rally ended", [0.8] * 30 + [float("nan")] * 30),
+        ("a slow decline above the share", [0.8] * 30 + [0.5] * 100),
+    ],
+)
+def test_what_is_no_divergence(what, rates):
+    assert divergence(history(rates), True, GUARD) == "", what
+
+
+def test_parameters_that_are_not_finite_are_a_divergence_at_once():
+    assert divergence(Health(), False, GUARD) == "parameters are not finite"
+
+
+def test_a_guard_of_nothing_never_barks():
+    config = GuardConfig(collapse=0.0)
+
+    assert divergence(history([0.9] * 50 + [0.0] * 500, config), True, config) == ""
+
+
+def test_only_a_stage_near_its_best_is_good_to_go_back_to():
+    assert history([0.8] * 30).is_good
+    assert not history([0.8] * 30 + [0.6] * 10).is_good
+    assert not Health().is_good
+
+
+def test_going_back_takes_the_learned_and_leaves_the_time(tmp_path):
+    training = make_training()
+    training.run_epoch([make_rollout(1)])
+    good = save(tmp_path, training, EXTRAS)
+    learned = {name: value.clone() for name, value in training.network.state_dict().items()}
+    for seed in range(2, 5):
+        training.run_epoch([make_rollout(seed)])
+    before = training.progress
+
+    training.go_back(lambda t: restore(good, t))
+
+    for name, value in training.network.state_dict().items():
+        assert torch.equal(value, learned[name])
+    after = training.progress
+    assert (after.version, after.epoch, after.frames) == (before.version, before.epoch, before.frames)
+    assert after.rollbacks == 1
+    assert after.learning_rate <= max(0.5 * before.learning_rate, training.ppo.learning_rate_min)
+
+
+def test_weights_that_blow_up_are_told_with_the_epoch():
+    training = make_training()
+    with torch.no_grad():
+        training.network.mean.weight[0, 0] = float("nan")
+
+    assert training.run_epoch([make_rollout(1)]).diverged == "parameters are not finite"
+
+
+def test_health_survives_a_checkpoint(tmp_path):
+    training = make_training()
+    training.run_epoch([make_rollout(1)])
+    path = save(tmp_path, training, EXTRAS)
+    resumed = make_training()
+    restore(path, resumed)
+
+    assert resumed.progress == training.progress
+    assert isinstance(resumed.progress.health, Health)
+
+
+def test_one_good_checkpoint_is_kept_and_outlives_the_newest(tmp_path):
+    training = make_training()
+    for seed in range(6):
+        training.run_epoch([make_rollout(seed)])
+        path = save(tmp_path, training, EXTRAS)
+        if seed < 2:
+            keep(path, tmp_path / checkpoint.GOOD)
+
+    kept = checkpoint.checkpoints(tmp_path / checkpoint.GOOD)
+    assert [file.name for file in kept] == ["00000002.safetensors"]
+    assert kept[0].name not in [file.name for file in checkpoint.checkpoints(tmp_path)]
+    restore(kept[0], training)
+    assert training.progress.version == 2
