@@ -39,7 +39,9 @@ from common.rally.observation import (
 )
 
 WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
+_ACTING = ("trunk.", "mean.", "log_sigma")  # the policy's parameters; the others are the critic's
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
+_MOMENTS = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)
 
 
 class PolicyError(ReportedError, ValueError):
@@ -170,7 +172,7 @@ def observation_moments(
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """A policy to play: network, frozen normaliser and contract."""
+    """A policy to play: network, frozen normaliser and contract. Read from a folder, its critic is a blank."""
 
     network: ActorCritic
     moments: Moments
@@ -187,10 +189,13 @@ class Policy:
 
 
 def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
-    """Write the two files of a policy into ``folder``, which nobody reads yet."""
+    """Write the two files of a policy into ``folder``, which nobody reads yet: what acts, and not the critic."""
     folder.mkdir(parents=True, exist_ok=True)
-    tensors: dict[str, npt.NDArray[Any]] = dict(state_tensors(network))
-    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean, moments.var
+    tensors: dict[str, npt.NDArray[Any]] = {
+        name: value for name, value in state_tensors(network).items() if name.startswith(_ACTING)
+    }
+    seen = network.obs_size
+    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean[:seen], moments.var[:seen]
     tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
     (folder / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
     (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
@@ -243,15 +248,17 @@ def load_policy(folder: Path) -> Policy:
             f"{folder / CONTRACT_FILE}: its observation or action layout is not this version's "
             f"({size(policy_layout(options))} and {ACTION_SIZE} numbers, see common/rally/observation.py)"
         )
-    for name in (_OBS_MEAN, _OBS_VAR, _OBS_COUNT):
+    for name in _MOMENTS:
         if name not in tensors:
             raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
-    moments = observation_moments(
-        tensors.pop(_OBS_MEAN), tensors.pop(_OBS_VAR), int(tensors.pop(_OBS_COUNT)), options
-    )
-    network = new_network(contract.network, options)
-    load_state(network, tensors)
-    return Policy(network, moments, contract)
+    mean, var, count = tensors[_OBS_MEAN], tensors[_OBS_VAR], int(tensors[_OBS_COUNT])
+    allowed = (size(policy_layout(options)),)
+    if not mean.shape == var.shape == allowed:
+        raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
+    network = new_network(contract.network, options.model_copy(update={"critic": "policy"}))
+    fresh = {name: value for name, value in state_tensors(network).items() if not name.startswith(_ACTING)}
+    load_state(network, fresh | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    return Policy(network, Moments(mean, var, count), contract)
 
 
 def new_network(

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
@@ -11,6 +12,7 @@ from common.policy.weights import (
     CONTRACT_FILE,
     WEIGHTS_FILE,
     Contract,
+    Policy,
     PolicyError,
     load_policy,
     new_network,
@@ -20,7 +22,7 @@ from common.policy.weights import (
     task_hash,
     unpack,
 )
-from common.rally.observation import PAPER_OBSERVATION
+from common.rally.observation import PAPER_OBSERVATION, ObservationConfig
 
 SMALL = NetworkConfig(units=(16, 8))
 
@@ -57,11 +59,29 @@ def test_a_policy_comes_back_from_its_folder_bit_for_bit(tmp_path):
 
     policy = load_policy(tmp_path / "latest")
 
-    for name, value in network.state_dict().items():
-        assert torch.equal(value, policy.network.state_dict()[name])
+    acting = [name for name in network.state_dict() if not name.startswith("value.")]
+    for name in acting:
+        assert torch.equal(network.state_dict()[name], policy.network.state_dict()[name])
     np.testing.assert_array_equal(policy.moments.mean, moments.mean)
     assert policy.moments.count == moments.count
     assert policy.contract == make_contract()
+
+
+def test_a_folder_holds_what_acts_and_not_the_critic(tmp_path):
+    """So that a policy stays readable when what its critic saw has changed."""
+    options = ObservationConfig(history=2)
+    network = new_network(SMALL, options)
+    moments = Moments(np.zeros(73), np.ones(73), 5)
+    contract = make_contract(observation=observation_contract(options), observation_options=options)
+    save_policy(tmp_path / "p", network, moments, contract)
+
+    policy = load_policy(tmp_path / "p")
+    tensors = load_file(tmp_path / "p" / WEIGHTS_FILE)
+    obs = np.random.default_rng(0).normal(size=(3, 73)).astype(np.float32)
+
+    assert not any(name.startswith(("value", "judge", "critic")) for name in tensors)
+    assert policy.moments.mean.shape == (37 + 2 * 6,)
+    np.testing.assert_array_equal(policy.act(obs), Policy(network, moments, contract).act(obs))
 
 
 def test_a_newer_policy_replaces_the_older_which_stays_once_more_for_its_readers(tmp_path):
