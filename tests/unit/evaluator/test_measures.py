@@ -60,17 +60,18 @@ def test_rates_without_trials_are_nothing_and_the_line_is_still_json():
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_best_is_a_later_stage_then_its_rate_then_the_landing_error():
+def test_best_is_a_later_stage_then_a_percent_of_balls_against_a_centimetre():
     def found(catch, back, error):
         return {"catch_rate": catch, "return_rate": back, "target_error_mean": error}
 
     ranking = [
         score(1, found(0.2, 0.0, None)),
         score(1, found(0.9, 0.0, None)),
+        score(3, found(0.5, 0.0, None)),
         score(3, found(0.5, 0.1, 0.4)),
-        score(3, found(0.4, 0.3, None)),
         score(3, found(0.4, 0.3, 0.5)),
         score(3, found(0.4, 0.3, 0.4)),
+        score(3, found(0.4, 0.35, 0.44)),  # five percent more balls are worth four centimetres
     ]
 
     assert ranking == sorted(ranking)

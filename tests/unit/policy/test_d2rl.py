@@ -8,9 +8,11 @@ from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_d
 from common.policy.d2rl import D2RL
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
-from common.rally.observation import ObservationConfig
+from common.rally.observation import PRIVILEGED, ObservationConfig, size
 
 PAPER_UNITS = (256, 128, 128, 64, 64, 32)
+
+TRUTH = size(PRIVILEGED)
 
 
 def by_hand(trunk, obs):
@@ -87,10 +89,10 @@ def test_log_probability_entropy_and_divergence_are_the_gaussians():
 
 def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it():
     torch.manual_seed(0)
-    network = new_network(NetworkConfig(units=(16, 8)), ObservationConfig(critic="privileged"))
-    obs = torch.randn(4, 37 + 17)
+    network = new_network(NetworkConfig(units=(16, 8)), ObservationConfig(history=0, critic="privileged"))
+    obs = torch.randn(4, 37 + TRUTH)
     other = obs.clone()
-    other[:, 37:] = torch.randn(4, 17)
+    other[:, 37:] = torch.randn(4, TRUTH)
 
     with torch.no_grad():
         (mean, value), (mean_other, value_other) = network(obs), network(other)
@@ -106,9 +108,9 @@ def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it(
 def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, critic):
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    config = ObservationConfig(critic=critic)
+    config = ObservationConfig(history=0, critic=critic)
     network = new_network(NetworkConfig(units=(32, 16, 8), trunks=trunks), config)
-    width = 37 + 17 * (critic == "privileged")
+    width = 37 + TRUTH * (critic == "privileged")
     old = Moments(rng.normal(size=width), rng.uniform(0.5, 2.0, size=width), 1)
     new = Moments(old.mean + 0.3 * rng.normal(size=width), old.var * rng.uniform(0.5, 2.0, size=width), 1)
     raw = (old.mean + 0.5 * rng.normal(size=(64, width))).astype(np.float32)

@@ -15,6 +15,7 @@ from common.rally.observation import (
     ACTION,
     OBSERVATION,
     PAPER_OBSERVATION,
+    PRIVILEGED,
     ObservationConfig,
     critic_layout,
     markdown,
@@ -131,7 +132,9 @@ def test_options_only_add_numbers_behind_the_papers(history, spin, critic):
     assert policy_layout(config)[: len(OBSERVATION)] == OBSERVATION
     assert critic_layout(config)[: len(policy_layout(config))] == policy_layout(config)
     assert size(policy_layout(config)) == 37 + 3 * spin + 6 * history
-    assert size(critic_layout(config)) - size(policy_layout(config)) == 17 * (critic == "privileged")
+    assert size(critic_layout(config)) - size(policy_layout(config)) == size(PRIVILEGED) * (
+        critic == "privileged"
+    )
 
 
 def played(config, steps=12, noise="standard"):
@@ -156,7 +159,7 @@ def test_the_memory_holds_what_was_seen_before_newest_first():
 
 def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():
     paper, _ = played(PAPER_OBSERVATION)
-    all_, truth = played(ObservationConfig(spin=True))
+    all_, truth = played(ObservationConfig(history=0, spin=True))
 
     np.testing.assert_array_equal(all_[:, :37], paper)
     np.testing.assert_allclose(all_[:, 37:40], truth[:, 6:9], rtol=1e-6)  # option spin

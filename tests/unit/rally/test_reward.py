@@ -238,7 +238,7 @@ def test_where_a_ball_is_heading_pays_in_stage_3_alone(stage):
     ("pos", "vel", "spin", "outcome"),
     [
         ((-1.0, 0.1, 0.3), (3.0, 0.5, 2.0), (0, 90, 20), Outcome.RETURNED),
-        ((-1.0, 0.1, 0.1), (5.0, 0.5, 0.5), (0, -60, 0), Outcome.NET),
+        ((-1.0, 0.1, 0.1), (5.0, 0.5, 0.9), (0, -20, 0), Outcome.NET),
         ((-1.0, 0.1, 0.3), (8.0, 0.5, 2.0), (0, 0, 50), Outcome.OUT),
         ((-1.0, 0.1, 0.3), (1.0, 0.0, 0.0), (0, 0, 0), Outcome.OWN_COURT),
     ],
