@@ -256,8 +256,12 @@ def load_policy(folder: Path) -> Policy:
     if not mean.shape == var.shape == allowed:
         raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
     network = new_network(contract.network, options.model_copy(update={"critic": "policy"}))
-    fresh = {name: value for name, value in state_tensors(network).items() if not name.startswith(_ACTING)}
-    load_state(network, fresh | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    blank = {
+        name: np.zeros_like(value)
+        for name, value in state_tensors(network).items()
+        if not name.startswith(_ACTING)
+    }
+    load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
     return Policy(network, Moments(mean, var, count), contract)
 
 
