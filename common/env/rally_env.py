@@ -283,7 +283,6 @@ class RallyEnv:
             robot.joint_vel,
             options.spin,
             is_privileged,
-            self._flight_model,
             self._obs,
         )
 

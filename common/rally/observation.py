@@ -59,18 +59,6 @@ PRIVILEGED: tuple[Part, ...] = (
         1.0,
         "restitution, its slope, alpha and spin loss of the racket in this rally",
     ),
-    Part(
-        "meets",
-        1,
-        "-",
-        0.0,
-        1.0,
-        "if every joint went on at its rate: would the ball come to the racket's plane",
-    ),
-    Part("meeting_time", 1, "s", 0.0, 0.25, "in how long; 0.2 where it would not"),
-    Part("meeting_place", 2, "m", -4.0, 4.0, "where on that plane, from the racket's centre: its y and z"),
-    Part("foreseen_miss", 2, "m", -3.0, 3.0, "and from the target to where it would then be heading: x, y"),
-    Part("foreseen_over_net", 1, "m", -1.0, 1.0, "and how high over the net's edge"),
 )
 """What the critic may see besides, in training: the simulator's truth. The policy never does."""
 

@@ -26,7 +26,7 @@ from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.draws import Stream, normal_pair, uniform
-from common.rally.heading import LONGEST_FLIGHT, LOOK_AHEAD, foresight, heading
+from common.rally.heading import LONGEST_FLIGHT, heading
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
@@ -483,7 +483,6 @@ def observe(
     joint_vel: Array,
     spin: bool,
     privileged: bool,
-    model: int,
     out: npt.NDArray[np.float32],
 ) -> None:
     """Write ``observation.critic_layout`` of ``rows`` (n,) into the same rows of ``out`` (B, D).
@@ -495,7 +494,6 @@ def observe(
         joint_vel: Joint velocities now (B, 7).
         spin: Whether the policy is told the true spin.
         privileged: Whether the critic's truth follows.
-        model: ``flight.SIMPLE`` or ``flight.FULL``: what the critic's foresight goes by.
         out: Rows to write.
     """
     for k in range(rows.shape[0]):
@@ -533,20 +531,3 @@ def observe(
                 o[at + j] = rallies.ball[b, j]
             for j in range(8):  # drag, lift, table, rubber
                 o[at + 9 + j] = rallies.condition[b, j]
-            if rallies.state[b] in (_TAU_1, _TAU_12):
-                ball = rallies.ball[b]
-                seen = foresight(
-                    (ball[0], ball[1], ball[2]),
-                    (ball[3], ball[4], ball[5]),
-                    (ball[6], ball[7], ball[8]),
-                    rallies.condition[b],
-                    joints,
-                    rates,
-                    model,
-                )
-                o[at + 17], o[at + 18], o[at + 19], o[at + 20] = seen.meets, seen.time, seen.side, seen.up
-                o[at + 21], o[at + 22], o[at + 23] = seen.miss_x, seen.miss_y, seen.over_net
-            else:
-                o[at + 17], o[at + 18] = 0.0, LOOK_AHEAD
-                for j in range(5):
-                    o[at + 19 + j] = 0.0

@@ -8,7 +8,6 @@ import pytest
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import EnvConfig, RallyEnv
 from common.physics.arm import racket_motion, racket_pose
-from common.physics.flight import SIMPLE
 from common.rally import play
 from common.rally.noise import PROFILES
 from common.rally.observation import (
@@ -36,7 +35,7 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
     start = np.array(joints) - 0.02 * np.array(rates)
     play.play_step(rallies, make_motion(start, joints), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
     out = np.empty((1, 37), np.float32)
-    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), False, False, SIMPLE, out)
+    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), False, False, out)
     return out[0]
 
 
