@@ -42,9 +42,6 @@ class PPOConfig(BaseModel):
     reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
     value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
     entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
-    lowest_log_sigma: float = Field(
-        -2.3, ge=-10, le=1, description="log of the action noise below which it is not learned away"
-    )
     bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
     gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
     learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
@@ -206,7 +203,6 @@ def update(
                 continue
             optimizer.step()
             with torch.no_grad():
-                network.log_sigma.clamp_(min=config.lowest_log_sigma)
                 kl = float(kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma))
                 outside = ((log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
             sums += (
