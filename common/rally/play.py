@@ -55,9 +55,7 @@ class Rallies(NamedTuple):
     clock: Integers  # (B,) grid steps since launch
     rounds_left: Integers  # (B,) rallies left in this episode, the one in play included
     aimed: npt.NDArray[np.bool_]  # (B,) the bonus for where the hit ball is heading has been paid
-    foreseen: npt.NDArray[
-        np.bool_
-    ]  # (B,) once hit, the ball's flight is flown to its end at once, robot apart
+    foreseen: npt.NDArray[np.bool_]  # (B,) once hit, it is flown to its end at once, robot apart
     caught: npt.NDArray[np.bool_]  # (B,) the racket touched the ball legally
     over: npt.NDArray[np.bool_]  # (B,) and it crossed the net after that
     landing: Array  # (B, 2) [m] where the ball landed; nan before a legal landing

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+NOT_FINITE = "parameters are not finite"
 RUNNING = 0.2  # weight of the newest dataset in the running measure
 GOOD_SHARE = 0.95  # of the stage's best: a checkpoint above it is one to go back to
 
@@ -62,7 +63,7 @@ def divergence(health: Health, finite: bool, config: GuardConfig) -> str:
         config: When.
     """
     if not finite:
-        return "parameters are not finite"
+        return NOT_FINITE
     if health.low_epochs >= config.patience:
         return f"rate {health.rate:.3f} for {health.low_epochs} epochs, best was {health.best:.3f}"
     return ""

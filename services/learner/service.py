@@ -33,6 +33,7 @@ from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
 from services.learner import checkpoint
 from services.learner.config import LearnerConfig
+from services.learner.guard import NOT_FINITE
 from services.learner.intake import Intake
 from services.learner.ledger import Ledger, Remembered
 from services.learner.record import Record, row
@@ -49,6 +50,10 @@ LEARNER_ID = "0"
 
 class RunExistsError(ReportedError):
     """A new run would overwrite an old one's checkpoints."""
+
+
+class DivergedError(ReportedError):
+    """Training has gone wrong for good."""
 
 
 @dataclass(slots=True)
@@ -203,7 +208,10 @@ class LearnerService:
         return 0.0 if trained else IDLE_WAIT_S
 
     def save(self) -> None:
-        """Write checkpoint and policy/latest."""
+        """Write checkpoint and policy/latest; what is ruined doesn't take the place of what was good."""
+        if not self.training.is_finite:
+            log.error("not saved: parameters are not finite epoch=%d", self.training.progress.epoch)
+            return
         extras = checkpoint.Extras(
             run=self._config.run,
             generation=self._generation,
@@ -253,9 +261,13 @@ class LearnerService:
         """Return to the last good checkpoint, if there is one."""
         good = checkpoint.checkpoints(self._folder.checkpoints / checkpoint.GOOD)
         if not good:
-            log.error(
-                "training has diverged reason=%r, and there is no good checkpoint to go back to", reason
-            )
+            if reason == NOT_FINITE:
+                raise DivergedError(
+                    f"training has diverged: {reason}, and there is no good checkpoint to go back to; "
+                    "try a lower --ppo.learning-rate-max"
+                )
+            self.training.forget_health()
+            log.warning("training has diverged reason=%r; no good checkpoint yet, going on", reason)
             return
         path = good[-1]
         self.training.go_back(lambda training: checkpoint.restore(path, training))

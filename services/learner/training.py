@@ -158,6 +158,11 @@ class Training:
             return max(1, config.epochs - progress.epoch)
         return max(1, (config.stage_1, config.stage_2)[progress.stage - 1] - progress.epochs_in_stage)
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether every parameter is."""
+        return all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
+
     def run_epoch(
         self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None
     ) -> EpochStats:
@@ -192,10 +197,13 @@ class Training:
             breathe,
             hold_policy=is_refitting,
         )
-        frozen = self.obs_moments
+        frozen = moments = self.obs_moments
         for rollout in rollouts:
-            self.obs_moments = self.obs_moments.merged(Moments.of(rollout.obs.reshape(-1, self.obs_size)))
+            moments = moments.merged(Moments.of(rollout.obs.reshape(-1, self.obs_size)))
             breathe()
+        self.obs_moments = (
+            moments  # at once, and with the weights below: who is answered meanwhile gets a whole policy
+        )
         if before.stage_number > 0:
             # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset: the
             # network must not play differently for it.
@@ -218,7 +226,6 @@ class Training:
         rate = measure / play.rallies if play.rallies else float("nan")
         # While the critic alone learns, the policy can't have gone wrong.
         health = before.health if is_refitting else watched(before.health, rate, self.guard)
-        finite = all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
         if changed:
             self.obs_moments = self.obs_moments.recounted()
         self.progress = Progress(
@@ -236,7 +243,7 @@ class Training:
             closing=0 if changed else closing,
         )
         lag = float(np.mean([before.version - r.version for r in rollouts]))
-        diverged = divergence(health, finite, self.guard)
+        diverged = divergence(health, self.is_finite, self.guard)
         return EpochStats(self.progress, stats, play, changed, diverged, lag, frames)
 
     @torch.no_grad()
@@ -245,6 +252,10 @@ class Training:
         weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
         for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(newest, weight)
+
+    def forget_health(self) -> None:
+        """Judge the stage's rate anew from now on."""
+        self.progress = replace(self.progress, health=Health())
 
     def go_back(self, load: Callable[["Training"], object]) -> None:
         """Take network, optimiser and moments from an earlier moment of this run; time doesn't go back.

@@ -1,11 +1,13 @@
 """Services that come late, die, come back or are missing: nobody waits for ever, and every rollout is accounted for."""
 
 import logging
+import shutil
 import threading
 
 import numpy as np
 import pytest
 import torch
+from safetensors.numpy import load_file
 
 from common.comms.messages import VerdictKind
 from common.comms.transport import TransportError
@@ -13,8 +15,9 @@ from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.policy.weights import load_policy
 from services.actor.service import NoRalliesError
+from services.learner.checkpoint import checkpoints
 from services.learner.intake import IntakeConfig
-from services.learner.service import RunExistsError
+from services.learner.service import DivergedError, RunExistsError
 from tests.integration.theatre import CURRICULUM, free_endpoint, stage, wait_until
 
 LONG = CURRICULUM.model_copy(update={"stage_3": 500})
@@ -271,3 +274,21 @@ def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it
 
     assert progress(learner).rollbacks == 1
     assert bool(weights.isfinite().all())
+
+
+def test_a_run_that_diverges_with_nothing_to_go_back_to_ends_with_one_line(tmp_path):
+    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        policy = tmp_path / "policy" / "latest"  # written last of the one save that there is
+        wait_until(policy.exists, 60, "a checkpoint")
+        wait_until(lambda n=progress(learner).epoch: progress(learner).epoch > n, 30, "an epoch after it")
+        shutil.rmtree(tmp_path / "checkpoints" / "good", ignore_errors=True)
+        with torch.no_grad():
+            learner.service.training.network.mean.weight[:] = float("nan")
+        with pytest.raises(DivergedError, match="no good checkpoint to go back to"):
+            learner.join(30)
+        newest = checkpoints(tmp_path / "checkpoints")[-1]
+
+    assert bool(np.isfinite(load_file(newest)["network.mean.weight"]).all())
