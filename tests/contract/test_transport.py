@@ -138,11 +138,22 @@ def test_a_full_subscription_drops_the_oldest_counts_them_and_keeps_the_order(ne
     inbox = actor.subscribe(f"{RUN}/status/a", capacity=10)
     subscribed(hub, f"{RUN}/status/a")
 
-    for number in range(300):
-        hub.publish(f"{RUN}/status/a", b"%d" % number, Flow.STAGE)
-    until(lambda: inbox.dropped == 290)
+    # Hints may be lost on a crowded way, and then the mailbox never sees them: so until enough have come.
+    published = 0
+    while inbox.dropped < 100 and published < 20_000:
+        hub.publish(f"{RUN}/status/a", b"%d" % published, Flow.STAGE)
+        published += 1
+        time.sleep(0.0005)
+    last = -1
+    while last != inbox.dropped:  # those under way
+        last = inbox.dropped
+        time.sleep(0.2)
+    kept = [int(sample.payload) for sample in inbox.poll()]
 
-    assert [int(sample.payload) for sample in inbox.poll()] == list(range(290, 300))
+    assert len(kept) == 10
+    assert kept == sorted(set(kept))
+    assert 100 <= inbox.dropped <= published - 10
+    assert kept[0] >= inbox.dropped  # the oldest went, and every one that went was counted
 
 
 def test_a_subscription_that_was_closed_gets_nothing_more(net):
