@@ -58,7 +58,7 @@ def train(name: str, minutes: float, goal: tuple[float, float], more: list[str],
     with subprocess.Popen([*command, *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             while process.poll() is None:
-                for row in read_curve(folder.report / "evaluations.csv")[len(curve) :]:
+                for row in read_curve(folder.evaluations)[len(curve) :]:
                     row["minutes"] = round((time.monotonic() - started) / 60.0, 2)
                     curve.append(row)
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)

@@ -59,6 +59,11 @@ class RunFolder:
         """Evaluations and reports."""
         return self.root / "report"
 
+    @property
+    def evaluations(self) -> Path:
+        """The evaluator's curve: one row an evaluation."""
+        return self.report / "evaluations.csv"
+
     def create(self) -> None:
         """Make the folders."""
         for path in (self.tensorboard, self.checkpoints, self.latest_policy.parent, self.logs, self.report):

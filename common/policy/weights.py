@@ -161,10 +161,13 @@ def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) ->
 
 
 def observation_moments(
-    mean: npt.NDArray[np.float64], var: npt.NDArray[np.float64], count: int, config: ObservationConfig
+    mean: npt.NDArray[np.float64],
+    var: npt.NDArray[np.float64],
+    count: int,
+    layout: tuple[Part, ...],
 ) -> Moments:
-    """Return the moments that came with a policy; raises PolicyError if they are not those of its observation."""
-    allowed = (size(critic_layout(config)),)
+    """Return the moments that came with a policy; raises PolicyError if they are not those of ``layout``."""
+    allowed = (size(layout),)
     if not mean.shape == var.shape == allowed:
         raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
     return Moments(mean, var, count)
@@ -251,10 +254,9 @@ def load_policy(folder: Path) -> Policy:
     for name in _MOMENTS:
         if name not in tensors:
             raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
-    mean, var, count = tensors[_OBS_MEAN], tensors[_OBS_VAR], int(tensors[_OBS_COUNT])
-    allowed = (size(policy_layout(options)),)
-    if not mean.shape == var.shape == allowed:
-        raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
+    moments = observation_moments(
+        tensors[_OBS_MEAN], tensors[_OBS_VAR], int(tensors[_OBS_COUNT]), policy_layout(options)
+    )
     network = new_network(contract.network, options.model_copy(update={"critic": "policy"}))
     blank = {
         name: np.zeros_like(value)
@@ -262,7 +264,7 @@ def load_policy(folder: Path) -> Policy:
         if not name.startswith(_ACTING)
     }
     load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
-    return Policy(network, Moments(mean, var, count), contract)
+    return Policy(network, moments, contract)
 
 
 def new_network(

@@ -4,18 +4,16 @@ import math
 
 from common.jit import kernel
 from common.physics.arm import Array
-from common.physics.constants import BALL_RADIUS, NET_HEIGHT
+from common.physics.constants import BALL_RADIUS, GRID_STEP, NET_HEIGHT
 from common.physics.flight import flight_step
 from common.physics.vec import Vec
 
-LONGEST_FLIGHT = 3.0  # [s] of a ball that was hit, to the floor at the latest
+LONGEST_RETURN = 3.0  # [s] of a ball that was hit, to the floor at the latest
 NOT_THAT_FAR = -1.0  # [m] height over the net of a ball that comes down before it
 
 
 @kernel
-def heading(
-    pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int, step: float
-) -> tuple[float, float, float]:
+def heading(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, float]:
     """Return where a ball would come down to the table's height, were nothing in its way.
 
     Args:
@@ -24,15 +22,14 @@ def heading(
         spin: Spin [rad/s].
         condition: The rally's ``noise.Condition`` (14,).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
-        step: Of the Runge-Kutta integration [s].
 
     Returns:
         x and y there [m], and by how much the ball clears the net on its way [m]; -1 if it doesn't come that far.
     """
     over_net = NOT_THAT_FAR
-    for _ in range(math.ceil(LONGEST_FLIGHT / step)):
+    for _ in range(math.ceil(LONGEST_RETURN / GRID_STEP)):
         before = pos
-        pos, vel = flight_step(pos, vel, spin, step, condition[0], condition[1], model)
+        pos, vel = flight_step(pos, vel, spin, GRID_STEP, condition[0], condition[1], model)
         if before[0] < 0.0 <= pos[0]:
             share = -before[0] / (pos[0] - before[0])
             over_net = before[2] + share * (pos[2] - before[2]) - NET_HEIGHT - BALL_RADIUS

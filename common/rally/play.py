@@ -26,7 +26,7 @@ from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.draws import Stream, normal_pair, uniform
-from common.rally.heading import LONGEST_FLIGHT, heading
+from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
@@ -371,7 +371,7 @@ def foresee(rallies: Rallies, b: int, flown: Flown, rules: Rules, no_robot: Arra
         if outcome == 0 and steps % rules.grid_steps == 0:
             near = norm(sub(pos, target))
             aim += 1.0 / ((1.0 + near * near) * (1.0 + near * near))
-        if steps * GRID_STEP >= LONGEST_FLIGHT:
+        if steps * GRID_STEP >= LONGEST_RETURN:
             outcome = _TIME_OUT
     return Flown(pos, vel, spin, state, outcome, False, False, landed, 0.0), aim
 
@@ -397,7 +397,7 @@ def settle(
     later_aim, bonus = 0.0, 0.0
     if rules.heading > 0.0 and flown.state == _TAU_23 and flown.outcome == 0 and not rallies.aimed[b]:
         rallies.aimed[b] = True
-        x, y, over_net = heading(flown.pos, flown.vel, flown.spin, condition, rules.flight_model, GRID_STEP)
+        x, y, over_net = heading(flown.pos, flown.vel, flown.spin, condition, rules.flight_model)
         off2 = ((x - condition[8]) ** 2 + (y - condition[9]) ** 2) / rules.heading_scale**2
         bonus = (1.0 if over_net > 0.0 else 0.5) * rules.heading / (1.0 + off2)
     if rallies.foreseen[b] and flown.state == _TAU_23 and flown.outcome == 0:

@@ -67,7 +67,10 @@ class Player:
                 "start both with the same network, env and launch settings"
             )
         moments = observation_moments(
-            snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, self.env.config.observation
+            snapshot.obs_mean,
+            snapshot.obs_var,
+            snapshot.obs_count,
+            critic_layout(self.env.config.observation),
         )
         unpack(self._network, snapshot.weights)
         self._moments = moments

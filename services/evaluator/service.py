@@ -23,6 +23,7 @@ from common.policy.weights import (
     save_policy,
     unpack,
 )
+from common.rally.observation import critic_layout
 from common.run_folder import RunFolder
 from services.evaluator.config import EvaluatorConfig
 from services.evaluator.match import evaluation_rallies, play_match
@@ -32,7 +33,6 @@ log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.2
 ANSWER_S = 5.0  # for the learner to answer with the policy
-CURVE_FILE = "evaluations.csv"
 CURVE = (
     "version",
     "frames",
@@ -187,7 +187,10 @@ class EvaluatorService:
         try:
             unpack(self._network, snapshot.weights)
             moments = observation_moments(
-                snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, self._config.env.observation
+                snapshot.obs_mean,
+                snapshot.obs_var,
+                snapshot.obs_count,
+                critic_layout(self._config.env.observation),
             )
         except PolicyError as error:
             self._refused("policy", error)
@@ -247,7 +250,7 @@ class EvaluatorService:
         )
 
     def _append(self, values: dict[str, Any]) -> None:
-        path = self._folder.report / CURVE_FILE
+        path = self._folder.evaluations
         is_new = not path.exists()
         with path.open("a", newline="") as file:
             writer = csv.DictWriter(file, fieldnames=CURVE, extrasaction="ignore")

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +16,7 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy, write_policy
 from common.process import DONE
 from services.evaluator import once
+from services.evaluator.report.origin import commit_of
 
 log = logging.getLogger(__name__)
 
@@ -75,20 +75,9 @@ def main(argv: Sequence[str], stop: Event) -> int:
             found[name]["return_after_catch"],
             found[name]["target_error_mean"],
         )
-    made_with = policy.contract.made_with | {"commit": commit()}
+    made_with = policy.contract.made_with | {"commit": commit_of(Path(__file__).parent) or "unknown"}
     contract = policy.contract.model_copy(update={"measures": found, "made_with": made_with})
     target = BOX / config.name
     write_policy(target, policy.network, policy.moments, contract)
     sys.stdout.write(json.dumps({"policy": str(target), "measures": found}) + "\n")
     return DONE
-
-
-def commit() -> str:
-    """Return the commit of the source tree, or "unknown" outside one."""
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return done.stdout.strip()

@@ -44,11 +44,18 @@ class Health:
         return self.low_epochs == 0 and self.rate >= GOOD_SHARE * self.best
 
 
+def running_mean(before: float, rate: float) -> float:
+    """Return the running mean after a dataset's ``rate``; nan: none yet before, or nothing to count in it."""
+    if np.isnan(before) or np.isnan(rate):
+        return before if np.isnan(rate) else rate
+    return (1 - RUNNING) * before + RUNNING * rate
+
+
 def watched(health: Health, rate: float, config: GuardConfig) -> Health:
     """Return ``health`` after a dataset in which the stage's measure was ``rate`` (nan: no rally ended)."""
     if np.isnan(rate):
         return health
-    running = rate if np.isnan(health.rate) else (1 - RUNNING) * health.rate + RUNNING * rate
+    running = running_mean(health.rate, rate)
     best = max(health.best, running)
     is_low = best >= config.least and running < config.collapse * best
     return Health(running, best, health.low_epochs + 1 if is_low else 0)

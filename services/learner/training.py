@@ -16,7 +16,7 @@ from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, criti
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
 from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
-from services.learner.guard import GuardConfig, Health, divergence, watched
+from services.learner.guard import GuardConfig, Health, divergence, running_mean, watched
 from services.learner.ppo import (
     Dataset,
     PPOConfig,
@@ -30,7 +30,6 @@ from services.learner.ppo import (
 Floats = npt.NDArray[np.float32]
 
 AVERAGE_DECAY = 0.99  # of the weights' running mean, a dataset: it looks back over some 0.8 M frames
-CATCH_WINDOW = 0.2  # weight of the newest epoch in the running catch rate that gates look at
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,9 +200,8 @@ class Training:
         for rollout in rollouts:
             moments = moments.merged(Moments.of(rollout.obs.reshape(-1, self.obs_size)))
             breathe()
-        self.obs_moments = (
-            moments  # at once, and with the weights below: who is answered meanwhile gets a whole policy
-        )
+        # At once, and with the weights below: who is answered meanwhile gets a whole policy.
+        self.obs_moments = moments
         if before.stage_number > 0:
             # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset: the
             # network must not play differently for it.
@@ -212,9 +210,10 @@ class Training:
         self._follow()
         play = play_stats(rollouts)
         frames = sum(r.rewards.size for r in rollouts)
-        caught = play.caught / play.rallies if play.rallies else before.catch_rate
-        old = caught if np.isnan(before.catch_rate) else before.catch_rate
-        running = (1 - CATCH_WINDOW) * old + CATCH_WINDOW * caught
+        caught, returned = (
+            count / play.rallies if play.rallies else float("nan") for count in (play.caught, play.returned)
+        )
+        running = running_mean(before.catch_rate, caught)
         # Without a look at the gate: when it opens, rollouts of this stage are on their way, and are trained on first.
         stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
         due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
@@ -222,8 +221,7 @@ class Training:
         if before.closing == 1:
             stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
-        measure = play.returned if before.stage == 3 else play.caught
-        rate = measure / play.rallies if play.rallies else float("nan")
+        rate = returned if before.stage == 3 else caught
         # While the critic alone learns, the policy can't have gone wrong.
         health = before.health if is_refitting else watched(before.health, rate, self.guard)
         if changed:

@@ -16,7 +16,6 @@ from common.run_folder import RUNS, RunFolder
 
 Array = npt.NDArray[np.float64]
 
-EVALUATIONS: Final = "evaluations.csv"
 CURVES: Final = ("target_error_mean", "catch_rate", "over_rate", "return_rate")
 """The paper's curves: average target error, catching, returning and return-to-opponent rate."""
 
@@ -81,9 +80,9 @@ def read(run: str, which: str = "best") -> Run:
     training = _training(folder.metrics)
     if training is None:
         missing.append("no epochs in metrics.csv: frames, hours and stages are unknown")
-    curve = _curve(folder.report / EVALUATIONS, training)
+    curve = _curve(folder.evaluations, training)
     if curve is None:
-        missing.append(f"no evaluations in report/{EVALUATIONS}: it has no training curves")
+        missing.append(f"no evaluations in report/{folder.evaluations.name}: it has no training curves")
     policy = None
     path = folder.best_policy if which == "best" else folder.latest_policy
     try:

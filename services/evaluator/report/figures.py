@@ -491,22 +491,20 @@ def _by_kind(
     return figure
 
 
+def _with_intervals(ax: Axes, at: Array, values: Array, bounds: Array, colour: str, label: str) -> None:
+    """Draw values (n,) at ``at`` (n,) as dots with their intervals (2, n)."""
+    ax.errorbar(
+        at, values, np.abs(bounds - values), color=colour, fmt="o", markersize=4, linewidth=1.1, label=label
+    )
+
+
 def rates(groups: Sequence[GroupResult], colours: dict[str, str]) -> Figure:
     """Return caught and returned shares by kind of ball."""
 
     def line(ax: Axes, at: Array, entries: list[dict[str, Any]], one: GroupResult, colour: str) -> None:
         returned = np.array([100 * entry["return_rate"] for entry in entries])
         bounds = np.array([entry["return_rate_ci"] for entry in entries]).reshape(-1, 2).T * 100
-        ax.errorbar(
-            at,
-            returned,
-            np.abs(bounds - returned),
-            color=colour,
-            fmt="o",
-            markersize=4,
-            linewidth=1.1,
-            label=one.label,
-        )
+        _with_intervals(ax, at, returned, bounds, colour, one.label)
         caught = [100 * entry["catch_rate"] for entry in entries]
         ax.plot(at, caught, "o", color=colour, markersize=4, markerfacecolor="white", markeredgewidth=0.9)
 
@@ -522,16 +520,7 @@ def errors(groups: Sequence[GroupResult], colours: dict[str, str]) -> Figure:
         landed = [k for k, entry in enumerate(entries) if entry["target_error_mean_ci"] is not None]
         far = np.array([entries[k]["target_error_mean"] for k in landed])
         bounds = np.array([entries[k]["target_error_mean_ci"] for k in landed]).reshape(-1, 2).T
-        ax.errorbar(
-            at[landed],
-            far,
-            np.abs(bounds - far),
-            color=colour,
-            fmt="o",
-            markersize=4,
-            linewidth=1.1,
-            label=one.label,
-        )
+        _with_intervals(ax, at[landed], far, bounds, colour, one.label)
 
     figure = _by_kind(groups, colours, "mean landing error [m]", line)
     means = [e["target_error_mean"] or 0.0 for one in groups for key in KINDS_SHOWN for e in one.by[key]]

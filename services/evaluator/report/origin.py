@@ -67,7 +67,7 @@ def versions() -> dict[str, str]:
             found[package] = version(package)
         except PackageNotFoundError:
             found[package] = "not installed"
-    commit = _commit(Path(__file__).parent)
+    commit = commit_of(Path(__file__).parent)
     return found | ({"commit": commit} if commit else {})
 
 
@@ -86,7 +86,7 @@ def _processor(cpuinfo: Path) -> str:
     return platform.processor() or platform.machine()
 
 
-def _commit(folder: Path) -> str:
+def commit_of(folder: Path) -> str:
     """Return the commit of the sources, with + where they differ from it; empty outside of a repository."""
     try:
         described = subprocess.run(

@@ -15,6 +15,7 @@ from common.rally.launch import RallyBlock
 from services.evaluator.breakdown import breakdown, survival
 from services.evaluator.match import evaluation_rallies, play_match
 from services.evaluator.measures import Played, measures
+from services.evaluator.once import task_of
 from services.evaluator.report.collect import CURVES, Curve, Run
 from services.evaluator.report.config import ReportConfig
 from services.evaluator.report.groups import Group, group
@@ -100,17 +101,8 @@ class Results:
 
 def evaluation_task(policy: Policy, rounds: int = 1) -> EnvConfig:
     """Return the task that a policy is measured on: ours but for what its weights were made for."""
-    contract = policy.contract
-    return EnvConfig.model_validate(
-        {
-            "noise": NOISE,
-            "collision": "tailored",
-            "rounds": rounds,
-            "control_rate_hz": contract.control_rate_hz,
-            "robot": contract.robot,
-            "observation": contract.observation_options,
-        }
-    )
+    # All policies play the same flights: those that the rallies were drawn with.
+    return task_of(policy.contract, EnvConfig(), NOISE, rounds).model_copy(update={"flight": "simple"})
 
 
 def results(runs: Sequence[Run], config: ReportConfig, breathe: Callable[[], None] = lambda: None) -> Results:

@@ -64,29 +64,27 @@ def metres(value: float | None, digits: int = 2) -> str:
     return NOTHING if value is None else f"{value:.{digits}f} m"
 
 
-def _rate_cell(found: Spread | None, interval: Sequence[float] | None) -> str:
-    """Return mean +- standard deviation over the seeds, and the interval of all rallies."""
+def _cell(
+    found: Spread | None, interval: Sequence[float] | None, scale: float, digits: int, unit: str
+) -> str:
+    """Return mean +- standard deviation over the seeds, and the interval of all rallies, times ``scale``."""
     if found is None:
         return NOTHING
-    text = f"{100 * found.mean:.1f}"
+    text = f"{scale * found.mean:.{digits}f}"
     if found.deviation is not None:
-        text += f" ± {100 * found.deviation:.1f}"
-    text += " %"
+        text += f" ± {scale * found.deviation:.{digits}f}"
+    text += f" {unit}"
     if interval:
-        text += f" [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
+        text += f" [{scale * interval[0]:.{digits}f}, {scale * interval[1]:.{digits}f}]"
     return text
+
+
+def _rate_cell(found: Spread | None, interval: Sequence[float] | None) -> str:
+    return _cell(found, interval, 100, 1, "%")
 
 
 def _metre_cell(found: Spread | None, interval: Sequence[float] | None) -> str:
-    if found is None:
-        return NOTHING
-    text = f"{found.mean:.3f}"
-    if found.deviation is not None:
-        text += f" ± {found.deviation:.3f}"
-    text += " m"
-    if interval:
-        text += f" [{interval[0]:.3f}, {interval[1]:.3f}]"
-    return text
+    return _cell(found, interval, 1, 3, "m")
 
 
 def _seeds(count: int) -> str:

@@ -83,7 +83,9 @@ def test_its_log_mu_and_values_are_those_of_the_policy_at_its_observations(block
     snapshot = make_snapshot(player)
     player.adopt(snapshot)
     network = player._network
-    moments = observation_moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, OBSERVATION)
+    moments = observation_moments(
+        snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, critic_layout(OBSERVATION)
+    )
     with torch.no_grad():
         mean, value = network(torch.from_numpy(normalize(block.obs.reshape(-1, SIZE), moments)))
         normal = torch.distributions.Normal(mean, network.log_sigma.exp())

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from common.physics.constants import GRID_STEP, NET_HEIGHT
+from common.physics.constants import NET_HEIGHT
 from common.physics.flight import SIMPLE, flight_step
 from common.rally.heading import NOT_THAT_FAR, heading
 from tests.unit.rally.scripted import begin, make_record
@@ -23,14 +23,10 @@ def test_a_heading_is_where_small_steps_come_down():
         if before[0] < 0 <= p[0]:
             over = p[2] - NET_HEIGHT - 0.020
 
-    np.testing.assert_allclose(
-        heading(pos, vel, spin, condition, SIMPLE, GRID_STEP), (p[0], p[1], over), atol=1e-3
-    )
+    np.testing.assert_allclose(heading(pos, vel, spin, condition, SIMPLE), (p[0], p[1], over), atol=1e-3)
 
 
 def test_a_ball_that_comes_back_before_the_net_never_clears_it():
-    _, _, over_net = heading(
-        (-1.0, 0.0, 0.3), (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), condition_of(), SIMPLE, GRID_STEP
-    )
+    _, _, over_net = heading((-1.0, 0.0, 0.3), (0.5, 0.0, 0.0), (0.0, 0.0, 0.0), condition_of(), SIMPLE)
 
     assert over_net == NOT_THAT_FAR
