@@ -51,6 +51,7 @@ fix: $(STAMP)             ## format, and mend what ruff can
 bench: $(STAMP)           ## all benchmarks
 	$(BIN)/python -m benchmarks.generator --json
 	$(BIN)/python -m benchmarks.env --json
+	$(BIN)/python -m benchmarks.estimator --json
 	$(BIN)/python -m benchmarks.system --json
 
 clean:                    ## remove the environment and caches, not the runs

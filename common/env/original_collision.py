@@ -204,6 +204,7 @@ def _follow(
     free: Rows,
     motion: play.Motion,
     rules: play.Rules,
+    noise: NoiseProfile,
     path: Array,
 ) -> play.Flown:
     """Follow ball b through MuJoCo's records of one control step, and judge each touch.
@@ -217,6 +218,7 @@ def _follow(
         free: Substeps since the last contact with each obstacle; written.
         motion: The robots' motion.
         rules: The rules.
+        noise: The profile.
         path: Robot b's joint positions (n + 1, 7).
     """
     ball = rallies.ball[b]
@@ -245,7 +247,9 @@ def _follow(
             state, outcome = play.judge(rallies, b, state, what, pos, rules)
         if outcome == 0:
             p, v, w = qpos[k, _BALL_POS:], qvel[k, _BALL_VEL:], qvel[k, _BALL_SPIN:]
+            p0, v0 = pos, vel
             pos, vel = (p[0], p[1], p[2]), (v[0], v[1], v[2])
+            play.shoot(rallies, b, noise, (k % per_grid_step) * motion.step, p0, v0, motion.step, pos, vel)
             spin = _turned(qpos[k, _BALL_TURN:], (w[0], w[1], w[2]))
             if abs(pos[0]) > touch.PLAY_X or abs(pos[1]) > touch.PLAY_Y:
                 state, outcome = play.judge(rallies, b, state, _OUT, pos, rules)
@@ -280,7 +284,7 @@ def _play_records(
             for sensor, obstacle in _FELT:
                 if found[b, k, obstacle] > 0.0:
                     motion.contact[b, k, sensor] = 0.0
-        flown = _follow(rallies, b, qpos[b], qvel[b], found[b], free[b], motion, rules, path)
+        flown = _follow(rallies, b, qpos[b], qvel[b], found[b], free[b], motion, rules, noise, path)
         play.settle(rallies, b, flown, motion, actions, rules, noise, path, step)
 
 

@@ -40,6 +40,10 @@ class EnvConfig(BaseModel):
     noise: Literal["off", "standard", "hard"] = Field(
         "standard", description="what differs from rally to rally"
     )
+    perception: Literal["cheap", "full"] = Field(
+        "cheap",
+        description="what is seen of the ball: its true state, late and noisy, or an estimate from a simulated camera",
+    )
     flight: Literal["simple", "full"] = Field("simple", description="aerodynamics of the ball")
     collision: Literal["tailored", "original"] = Field(
         "tailored",
@@ -171,7 +175,9 @@ class RallyEnv:
         self.noise = PROFILES[config.noise]
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
-        self._rallies, self._step = play.allocate(count, config.observation.history)
+        self._rallies, self._step = play.allocate(
+            count, config.observation.history, full=config.perception == "full"
+        )
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
         self._lengths = np.zeros(count, np.int32)

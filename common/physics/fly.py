@@ -39,7 +39,7 @@ _TABLE, _NET, _FLOOR, _RACKET, _BODY = 0, 1, 2, 3, 4
 
 
 @kernel
-def _path(p0: Vec, v0: Vec, p1: Vec, v1: Vec, h: float, t: float) -> Vec:
+def path_at(p0: Vec, v0: Vec, p1: Vec, v1: Vec, h: float, t: float) -> Vec:
     """Return the position at time t of the cubic through both ends of a step (error below 1e-8 m)."""
     s = t / h
     a = (1.0 + 2.0 * s) * (1.0 - s) * (1.0 - s)
@@ -92,21 +92,21 @@ def _march(
     gap = _gap(what, p0, trajectory, start, robot_step)
     if gap <= 0.0:
         later = _gap(
-            what, _path(p0, v0, p1, v1, h, SMALLEST_MARCH), trajectory, start + SMALLEST_MARCH, robot_step
+            what, path_at(p0, v0, p1, v1, h, SMALLEST_MARCH), trajectory, start + SMALLEST_MARCH, robot_step
         )
         if later < gap:
             return 0.0
     while t < end:
         last_t, last_gap = t, gap
         t = min(t + max(gap / closing, SMALLEST_MARCH), end)
-        gap = _gap(what, _path(p0, v0, p1, v1, h, t), trajectory, start + t, robot_step)
+        gap = _gap(what, path_at(p0, v0, p1, v1, h, t), trajectory, start + t, robot_step)
         if gap < 0.0 and last_gap >= 0.0:
             low, high, f_low, f_high = last_t, t, last_gap, gap
             for _ in range(60):
                 if high - low < _ROOT_TOLERANCE:
                     break
                 middle = low + (high - low) * f_low / (f_low - f_high)
-                f = _gap(what, _path(p0, v0, p1, v1, h, middle), trajectory, start + middle, robot_step)
+                f = _gap(what, path_at(p0, v0, p1, v1, h, middle), trajectory, start + middle, robot_step)
                 if f >= 0.0:
                     if f < 1e-13:
                         return middle

@@ -27,6 +27,8 @@ class Stream(IntEnum):
     CAMERA = 7
     BURST = 8
     RESET = 9
+    SHOT = 10
+    OUTLIER = 11
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

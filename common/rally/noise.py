@@ -35,6 +35,13 @@ class NoiseProfile(NamedTuple):
     loss: float  # [-] share of samples lost; the last one is held
     burst_share: float  # [-] share of rallies with a burst of lost samples
     burst_samples: Range  # length of a burst [camera samples]
+    camera_rate_hz: float  # [Hz] the simulated camera (perception full); at most 200
+    camera_jitter: (
+        float  # [s] sigma of each shot's moment about the rate's; its time stamp is the true moment
+    )
+    camera_noise: float  # [m] sigma of each shot and axis
+    outlier_share: float  # [-] share of shots that are gross errors
+    outlier_size: float  # [m] a gross error is uniform in +- this, per axis
 
 
 _RUBBER = ((0.85, 0.93), (0.015, 0.023), (0.64, 0.76), (0.0, 0.25))
@@ -57,6 +64,11 @@ PROFILES: dict[str, NoiseProfile] = {
         0.0,
         0.0,
         (0.0, 0.0),
+        CAMERA_RATE_HZ,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
     ),
     "standard": NoiseProfile(
         (0.85, 1.15),
@@ -72,6 +84,11 @@ PROFILES: dict[str, NoiseProfile] = {
         0.03,
         0.05,
         (5.0, 15.0),
+        CAMERA_RATE_HZ,
+        0.0007,
+        0.002,
+        0.005,
+        0.3,
     ),
     "hard": NoiseProfile(
         (0.75, 1.25),
@@ -90,6 +107,11 @@ PROFILES: dict[str, NoiseProfile] = {
         0.06,
         0.15,
         (5.0, 15.0),
+        CAMERA_RATE_HZ,
+        0.0007,
+        0.004,
+        0.01,
+        0.5,
     ),
 }
 """Profiles by name; ``standard`` is on in training and in every headline figure."""

@@ -25,7 +25,9 @@ from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
+from common.rally.camera import READ, SHOT, SHOTS, TAKEN, begin_film, film_flight
 from common.rally.draws import Stream, normal_pair, uniform
+from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
@@ -64,6 +66,10 @@ class Rallies(NamedTuple):
     head: Integers  # (B,)
     seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
     earlier: Array  # (B, history, 6) what it went by one, two ... control steps ago
+    shots: Array  # (B, SHOTS, 5) the simulated camera's shots; the four with no rows: perception is cheap
+    shot_counts: Integers  # (B, 3) camera.NEXT, TAKEN, READ
+    shot_due: Array  # (B, 1) [s since launch] when the next shot will be taken
+    estimate: Array  # (B, ESTIMATE) what the estimator makes of the shots that have arrived
     last_action: Array  # (B, 7)
 
 
@@ -118,8 +124,12 @@ class Flown(NamedTuple):
     racket_speed: float  # [m/s] v of the reward, where hit
 
 
-def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
-    """Return zeroed rows for ``count`` rallies that remember ``history`` earlier samples."""
+def allocate(count: int, history: int = 0, full: bool = False) -> tuple[Rallies, Step]:
+    """Return zeroed rows for ``count`` rallies that remember ``history`` earlier samples.
+
+    With ``full`` the ball is perceived by camera and estimator, otherwise by its true state, late and noisy.
+    """
+    filmed = count if full else 0
     rallies = Rallies(
         ball=np.zeros((count, 9)),
         state=np.zeros(count, np.int64),
@@ -137,6 +147,10 @@ def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
         head=np.zeros(count, np.int64),
         seen=np.zeros((count, SAMPLE)),
         earlier=np.zeros((count, history, 6)),
+        shots=np.zeros((filmed, SHOTS, SHOT)),
+        shot_counts=np.zeros((filmed, 3), np.int64),
+        shot_due=np.zeros((filmed, 1)),
+        estimate=np.zeros((filmed, ESTIMATE)),
         last_action=np.zeros((count, 7)),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
@@ -144,15 +158,11 @@ def allocate(count: int, history: int = 0) -> tuple[Rallies, Step]:
 
 
 @kernel
-def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
-    """Update what the robot sees of ball b: the sample of a latency ago with noise; if lost, the last one."""
+def _sample(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
+    """Show the true sample of a latency ago with noise; if lost, the last one."""
     seed = rallies.seed[b]
     moment = rallies.clock[b] * GRID_STEP
     condition = rallies.condition[b]
-    earlier = rallies.earlier[b]
-    for k in range(earlier.shape[0] - 1, -1, -1):
-        for j in range(6):
-            earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
     in_burst = condition[12] <= moment < condition[13]
     if step > 0 and (in_burst or uniform(seed, _CAMERA, 8 * step) < noise.loss):
         return
@@ -173,6 +183,48 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
         seen[4] = sample[4] + noise.velocity_noise * a4
         seen[5] = sample[5] + noise.velocity_noise * a5
     seen[6] = sample[6]
+
+
+@kernel
+def _estimate(rallies: Rallies, b: int, noise: NoiseProfile) -> None:
+    """Let the estimator take the shots that have arrived, and show its estimate for the usual latency ago.
+
+    The usual latency is the mean over rallies: what a policy expects of its samples' age, whoever perceives. The
+    camera's own, this rally's, is known, because it stamps its shots.
+    """
+    now = rallies.clock[b] * GRID_STEP
+    latency = rallies.condition[b, 10] * GRID_STEP
+    shots, counts, row = rallies.shots[b], rallies.shot_counts[b], rallies.estimate[b]
+    while counts[READ] < counts[TAKEN]:
+        shot = shots[counts[READ] % SHOTS]
+        pos = (shot[1], shot[2], shot[3])
+        if counts[READ] == 0:  # the launch itself is in view
+            begin_estimate(row, shot[0], pos, noise.camera_noise)
+            shot[4] = 1.0
+        elif shot[0] + latency > now + 1e-9:
+            break
+        elif take_shot(row, shot[0], pos, noise.camera_noise):
+            shot[4] = 1.0
+        counts[READ] += 1
+    usual = 0.5 * (noise.observation_latency[0] + noise.observation_latency[1])
+    pos, vel, state = estimate_at(row, max(now - usual, 0.0))
+    seen = rallies.seen[b]
+    for k in range(3):
+        seen[k], seen[3 + k] = pos[k], vel[k]
+    seen[6] = state
+
+
+@kernel
+def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
+    """Update what the robot sees of ball b, and what it remembers."""
+    earlier = rallies.earlier[b]
+    for k in range(earlier.shape[0] - 1, -1, -1):
+        for j in range(6):
+            earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
+    if rallies.estimate.shape[0] > 0:
+        _estimate(rallies, b, noise)
+    else:
+        _sample(rallies, b, step, noise)
 
 
 @kernel
@@ -202,6 +254,9 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
         for k in range(6):
             rallies.camera[b, row, k] = record[k]
         rallies.camera[b, row, 6] = 0.0
+    if rallies.estimate.shape[0] > 0:
+        pos = (record[0], record[1], record[2])
+        begin_film(rallies.shots[b], rallies.shot_counts[b], rallies.shot_due[b], seed, pos, noise)
     _look(rallies, b, 0, noise)
     for k in range(rallies.earlier.shape[1]):
         for j in range(6):
@@ -236,6 +291,40 @@ def judge(rallies: Rallies, b: int, state: int, what: int, pos: Vec, rules: Rule
 
 
 @kernel
+def shoot(
+    rallies: Rallies, b: int, noise: NoiseProfile, since: float, p0: Vec, v0: Vec, h: float, p1: Vec, v1: Vec
+) -> None:
+    """Let the camera film a piece of ball b's flight without touches, if there is a camera.
+
+    Args:
+        rallies: Row b is written.
+        b: Row.
+        noise: Profile.
+        since: When the piece begins, from the last ``film`` on [s].
+        p0: Position then [m].
+        v0: Velocity then [m/s].
+        h: Its duration [s].
+        p1: Position at its end [m].
+        v1: Velocity at its end, before any bounce [m/s].
+    """
+    if rallies.shots.shape[0] > 0:
+        film_flight(
+            rallies.shots[b],
+            rallies.shot_counts[b],
+            rallies.shot_due[b],
+            rallies.seed[b],
+            rallies.condition[b],
+            noise,
+            rallies.clock[b] * GRID_STEP + since,
+            p0,
+            v0,
+            h,
+            p1,
+            v1,
+        )
+
+
+@kernel
 def film(rallies: Rallies, b: int, pos: Vec, vel: Vec, state: int) -> None:
     """Let a grid step pass: put the camera's true sample into the ring."""
     rallies.clock[b] += 1
@@ -257,7 +346,9 @@ def copy_path(motion: Motion, b: int, path: Array) -> None:
 
 
 @kernel
-def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array, step: Step) -> Flown:
+def _fly_one(
+    rallies: Rallies, b: int, motion: Motion, rules: Rules, noise: NoiseProfile, path: Array, step: Step
+) -> Flown:
     """Fly ball b through one control step, with every touch in between."""
     fastest = speed_bound(path, motion.step)
     ball, condition = rallies.ball[b], rallies.condition[b]
@@ -273,6 +364,7 @@ def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array
         rest = GRID_STEP
         for _ in range(_TOUCHES_A_STEP):
             start = grid_step * GRID_STEP + (GRID_STEP - rest)
+            p0, v0 = pos, vel
             pos, vel, flown, what, normal = fly_step(
                 pos,
                 vel,
@@ -286,6 +378,7 @@ def _fly_one(rallies: Rallies, b: int, motion: Motion, rules: Rules, path: Array
                 motion.step,
                 fastest,
             )
+            shoot(rallies, b, noise, GRID_STEP - rest, p0, v0, flown, pos, vel)
             rest -= flown
             if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:
                 rallies.over[b] = True
@@ -460,7 +553,7 @@ def play_step(
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
         copy_path(motion, b, path)
-        flown = _fly_one(rallies, b, motion, rules, path, step)
+        flown = _fly_one(rallies, b, motion, rules, noise, path, step)
         settle(rallies, b, flown, motion, actions, rules, noise, path, step)
 
 

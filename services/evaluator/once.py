@@ -70,6 +70,7 @@ def measure(
         "rounds": config.rounds,
         "seed": config.seed,
         "collision": env.collision,
+        "perception": env.perception,
         "policy": str(folder),
         "seconds": round(time.monotonic() - started, 2),
     }

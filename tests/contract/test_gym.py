@@ -56,6 +56,12 @@ def test_every_observation_lies_in_the_space(noise):
     assert all(env.observation_space.contains(obs) for obs in play(env, 200))
 
 
+def test_with_camera_and_estimator_every_observation_lies_in_the_space_too():
+    env = make(perception="full")
+
+    assert all(env.observation_space.contains(obs) for obs in play(env, 200))
+
+
 def test_the_spaces_are_the_layouts():
     env = make()
 

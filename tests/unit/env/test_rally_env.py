@@ -69,7 +69,13 @@ def drop_on(env: RallyEnv, x: float, row: int = 0) -> None:
 
 
 @pytest.mark.parametrize(
-    "config", [STANDARD, STANDARD.model_copy(update={"go_on": 1.0})], ids=["ends", "goes on"]
+    "config",
+    [
+        STANDARD,
+        STANDARD.model_copy(update={"go_on": 1.0}),
+        STANDARD.model_copy(update={"perception": "full", "go_on": 1.0}),
+    ],
+    ids=["ends", "goes on", "camera"],
 )
 def test_a_batch_equals_its_environments_one_by_one_bit_for_bit(config):
     deck = Dealt(draw_rallies(200, seed=3))
