@@ -138,7 +138,7 @@ class Episodes:
 class Rollout:
     """One contiguous block of T control steps in B environments, as it was played."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     run: str
     generation: Count
@@ -161,6 +161,8 @@ class Rollout:
     rally_flags: Annotated[U8, Wire("bits", "|u1", "T B", low=0, high=UNVALIDATED)]
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
+    # What the actions before a hit should have differed by (hindsight.correction); 0 where nothing is known
+    corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 
     def fault(self) -> str:

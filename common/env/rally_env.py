@@ -25,6 +25,7 @@ Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
+_TOLD = {"hidden": play.SPIN_HIDDEN, "estimated": play.SPIN_ESTIMATED, "true": play.SPIN_TRUE}
 _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
 
 
@@ -63,6 +64,9 @@ class EnvConfig(BaseModel):
         ge=0,
         le=1,
         description="share of episodes that end once the ball is hit: its flight home is computed and paid at once",
+    )
+    hindsight: bool = Field(
+        True, description="in stage 3, tell the learner what the last actions before a hit should have been"
     )
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     reset_spread: float = Field(
@@ -122,6 +126,11 @@ class EnvStep:
     final_obs: Floats  # (n, D) the last observation of each of ``ended``
     terms: Array  # (B, 8) reward.TERMS
     finished: FinishedRallies
+    corrected: Rows  # (n,) balls that were hit, and whose hit says what the last actions should have been
+    corrections: (
+        Floats  # (n, BACK, 7) by what those differed from it, this step's first: hindsight.correction
+    )
+    corrected_steps: Rows  # (n,) how many steps back that reaches within the rally
 
 
 @kernel
@@ -175,8 +184,15 @@ class RallyEnv:
         self.noise = PROFILES[config.noise]
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
+        # MuJoCo's own contact has no law that could be differentiated.
+        self._corrects = config.hindsight and config.collision == "tailored"
+        self._drives = self.robot.drives
         self._rallies, self._step = play.allocate(
-            count, config.observation.history, full=config.perception == "full"
+            count,
+            config.observation.history,
+            full=config.perception == "full",
+            tracked=config.observation.spin == "estimated",
+            corrected_substeps=self.robot.substeps if self._corrects else 0,
         )
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
@@ -208,6 +224,8 @@ class RallyEnv:
             grid_steps=round(1.0 / (config.control_rate_hz * GRID_STEP)),
             time_limit=config.time_limit_s,
             flight_model=self._flight_model,
+            corrects=self._corrects and stage == 3,
+            drives=self._drives,
         )
 
     @property
@@ -257,6 +275,9 @@ class RallyEnv:
         terminated[ended] = True
         terminated &= ~truncated
         final_obs = self._obs[ended]
+        corrected = np.flatnonzero(self._rallies.corrected)
+        corrections = self._rallies.corrections[corrected].astype(np.float32)
+        corrected_steps = self._rallies.corrected[corrected]
         finished = self._finish(over)
         if over.size:
             self._begin(over, goes_on)
@@ -270,6 +291,9 @@ class RallyEnv:
             final_obs=final_obs,
             terms=self._step.terms.copy(),
             finished=finished,
+            corrected=corrected,
+            corrections=corrections,
+            corrected_steps=corrected_steps,
         )
 
     def _make_collision(self, threads: int) -> Collision:
@@ -287,7 +311,8 @@ class RallyEnv:
             rows,
             robot.joint_pos,
             robot.joint_vel,
-            options.spin,
+            _TOLD[options.spin],
+            options.age,
             is_privileged,
             self._obs,
         )

@@ -141,6 +141,16 @@ class RobotBatch:
         self._damping[rows, :7] = self._damping_nominal * factors[:, 2]
         self._late_substeps[rows] = np.rint(action_latency / self.step_s).astype(np.int64)
 
+    @property
+    def drives(self) -> Array:
+        """``common.rally.hindsight``'s table of the drives (5, 7): inertia at home, k_p, k_v, damping, half-range."""
+        data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, data, 0)
+        mujoco.mj_forward(self.model, data)
+        inertia = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, data, inertia)
+        return np.stack([np.diag(inertia)[:7], self._kp, self._kv, self._damping_nominal, self.half_range])
+
     def push_racket(self, impulse: Array) -> None:
         """Apply (B, 6) impulses [N s, N m s] about the racket's centre, spread over the next control step."""
         self._wrench[:, self._racket] = impulse * (1.0 / (self.substeps * self.step_s))

@@ -37,7 +37,22 @@ OBSERVATION: tuple[Part, ...] = (
 SPIN: tuple[Part, ...] = (
     Part("ball_spin", 3, "rad/s", -1500.0, 1500.0, "the ball's true spin: no robot is told it"),
 )
-"""Option ``spin``: a ceiling to measure against."""
+"""Option ``spin: true``: a ceiling to measure against."""
+
+SPIN_ESTIMATE: tuple[Part, ...] = (
+    Part(
+        "spin_estimate",
+        3,
+        "rad/s",
+        -1500.0,
+        1500.0,
+        "the ball's spin as its flight before the bounce tells it",
+    ),
+)
+"""Option ``spin: estimated``: what a robot can find out by itself."""
+
+AGE: tuple[Part, ...] = (Part("sample_age", 1, "s", 0.0, 2.5, "how long ago the ball was where it is seen"),)
+"""Option ``age``: latency and lost samples are known to whoever stamps his samples."""
 
 EARLIER: tuple[Part, ...] = (
     Part("earlier_ball_pos", 3, "m", -4.0, 4.0, "ball as perceived some control steps ago"),
@@ -87,10 +102,15 @@ class ObservationConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     history: int = Field(
-        6, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
+        4, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
     )
-    spin: bool = Field(
-        False, description="tell the policy the ball's true spin: a ceiling, nothing for a robot"
+    spin: Literal["hidden", "estimated", "true"] = Field(
+        "estimated",
+        description="the ball's spin as the policy is told it: not at all, as its flight tells (spin_estimate.py), or "
+        "the truth: a ceiling, nothing for a robot",
+    )
+    age: bool = Field(
+        True, description="tell the policy how old its ball sample is: samples carry a time stamp"
     )
     critic: Literal["policy", "privileged"] = Field(
         "privileged",
@@ -98,7 +118,7 @@ class ObservationConfig(BaseModel):
     )
 
 
-PAPER_OBSERVATION = ObservationConfig(history=0, critic="policy")
+PAPER_OBSERVATION = ObservationConfig(history=0, spin="hidden", age=False, critic="policy")
 """The paper's: 37 numbers for policy and critic alike."""
 
 
@@ -107,7 +127,8 @@ def policy_layout(config: ObservationConfig) -> tuple[Part, ...]:
     earlier = tuple(
         part._replace(name=f"{part.name}_{k}") for k in range(1, config.history + 1) for part in EARLIER
     )
-    return OBSERVATION + (SPIN if config.spin else ()) + earlier
+    spin = {"hidden": (), "estimated": SPIN_ESTIMATE, "true": SPIN}[config.spin]
+    return OBSERVATION + spin + (AGE if config.age else ()) + earlier
 
 
 def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
@@ -129,7 +150,9 @@ def markdown() -> str:
     ]
     tables = (
         ("Observation", OBSERVATION),
-        ("Option spin, after it", SPIN),
+        ("Option spin, after it: estimated", SPIN_ESTIMATE),
+        ("or true", SPIN),
+        ("Option age, after that", AGE),
         ("Option history, after that, each", EARLIER),
         ("What the critic alone sees, last", PRIVILEGED),
         ("Action", ACTION),

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.arm import (
+    Joints,
     joint_rates_at,
     joints_at,
     point_velocity,
@@ -29,7 +30,19 @@ from common.rally.camera import READ, SHOT, SHOTS, TAKEN, begin_film, film_fligh
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
+from common.rally.hindsight import (
+    BACK,
+    BALL_POS,
+    BALL_SPIN,
+    BALL_VEL,
+    HIT,
+    JOINT_POS,
+    JOINT_VEL,
+    MOMENT,
+    correction,
+)
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
+from common.rally.spin_estimate import BOUNCED, SPIN, TRACK, begin_track, follow, turn_at_bounce
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
 Array = npt.NDArray[np.float64]
@@ -40,6 +53,8 @@ SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0
 CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
+SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
+_AT_LIMIT = 1.0 - 1e-9  # [-] share of a drive's largest force from which on it is at its limit
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -70,7 +85,15 @@ class Rallies(NamedTuple):
     shot_counts: Integers  # (B, 3) camera.NEXT, TAKEN, READ
     shot_due: Array  # (B, 1) [s since launch] when the next shot will be taken
     estimate: Array  # (B, ESTIMATE) what the estimator makes of the shots that have arrived
+    taken: Array  # (B,) when that sample was taken, since launch [s]: samples carry a time stamp
+    track: Array  # (B, TRACK) what the samples tell of the spin; no rows: nobody asks
     last_action: Array  # (B, 7)
+    hit: Array  # (B, HIT) ball and joints at the contact; the four with no rows: hits are not corrected
+    limited: npt.NDArray[
+        np.bool_
+    ]  # (B, BACK, n, 7) drives at their limit, by control step (a ring) and substep
+    corrections: Array  # (B, BACK, 7) what the last actions should have differed by, the contact's step first
+    corrected: Integers  # (B,) over how many steps back, where a correction was found in this step; else 0
 
 
 class Motion(NamedTuple):
@@ -99,6 +122,8 @@ class Rules(NamedTuple):
     grid_steps: int  # a control step
     time_limit: float  # [s] a rally
     flight_model: int
+    corrects: bool  # whether hits are corrected in this stage
+    drives: Array  # (5, 7) ``hindsight``'s table of the robot's drives
 
 
 class Step(NamedTuple):
@@ -124,12 +149,19 @@ class Flown(NamedTuple):
     racket_speed: float  # [m/s] v of the reward, where hit
 
 
-def allocate(count: int, history: int = 0, full: bool = False) -> tuple[Rallies, Step]:
-    """Return zeroed rows for ``count`` rallies that remember ``history`` earlier samples.
+def allocate(
+    count: int, history: int = 0, full: bool = False, tracked: bool = False, corrected_substeps: int = 0
+) -> tuple[Rallies, Step]:
+    """Return zeroed rows for ``count`` rallies.
 
-    With ``full`` the ball is perceived by camera and estimator, otherwise by its true state, late and noisy.
+    Args:
+        count: B.
+        history: How many earlier samples are remembered.
+        full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
+        tracked: Whether spin is estimated.
+        corrected_substeps: MuJoCo's substeps a control step, where hits are corrected; 0: they aren't.
     """
-    filmed = count if full else 0
+    filmed, corrected = count if full else 0, count if corrected_substeps else 0
     rallies = Rallies(
         ball=np.zeros((count, 9)),
         state=np.zeros(count, np.int64),
@@ -151,7 +183,13 @@ def allocate(count: int, history: int = 0, full: bool = False) -> tuple[Rallies,
         shot_counts=np.zeros((filmed, 3), np.int64),
         shot_due=np.zeros((filmed, 1)),
         estimate=np.zeros((filmed, ESTIMATE)),
+        taken=np.zeros(count),
+        track=np.zeros((count if tracked else 0, TRACK)),
         last_action=np.zeros((count, 7)),
+        hit=np.zeros((corrected, HIT)),
+        limited=np.zeros((corrected, BACK, corrected_substeps, 7), np.bool_),
+        corrections=np.zeros((corrected, BACK, 7)),
+        corrected=np.zeros(corrected, np.int64),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
     return rallies, step
@@ -166,6 +204,7 @@ def _sample(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     in_burst = condition[12] <= moment < condition[13]
     if step > 0 and (in_burst or uniform(seed, _CAMERA, 8 * step) < noise.loss):
         return
+    rallies.taken[b] = max(moment - condition[10] * GRID_STEP, 0.0)
     row = (rallies.head[b] + RING - int(condition[10])) % RING
     seen = rallies.seen[b]
     sample = rallies.camera[b, row]
@@ -207,7 +246,8 @@ def _estimate(rallies: Rallies, b: int, noise: NoiseProfile) -> None:
             shot[4] = 1.0
         counts[READ] += 1
     usual = 0.5 * (noise.observation_latency[0] + noise.observation_latency[1])
-    pos, vel, state = estimate_at(row, max(now - usual, 0.0))
+    rallies.taken[b] = max(now - usual, 0.0)
+    pos, vel, state = estimate_at(row, rallies.taken[b])
     seen = rallies.seen[b]
     for k in range(3):
         seen[k], seen[3 + k] = pos[k], vel[k]
@@ -221,10 +261,19 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     for k in range(earlier.shape[0] - 1, -1, -1):
         for j in range(6):
             earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
+    last = rallies.seen[b].copy()
     if rallies.estimate.shape[0] > 0:
         _estimate(rallies, b, noise)
     else:
         _sample(rallies, b, step, noise)
+    if rallies.track.shape[0] > 0:
+        track, seen = rallies.track[b], rallies.seen[b]
+        if step == 0:
+            begin_track(track, seen, noise.position_noise, noise.velocity_noise)
+        elif seen[6] == 0.0:
+            follow(track, seen, rallies.taken[b], noise.position_noise, noise.velocity_noise)
+        elif seen[6] == 1.0 and track[BOUNCED] == 0.0:
+            turn_at_bounce(track, last)
 
 
 @kernel
@@ -346,6 +395,42 @@ def copy_path(motion: Motion, b: int, path: Array) -> None:
 
 
 @kernel
+def note_hit(hit: Array, pos: Vec, vel: Vec, spin: Vec, joints: Joints, rates: Joints, moment: float) -> None:
+    """Write ball and joints at a contact into a row of ``hit`` (HIT,)."""
+    for k in range(3):
+        hit[BALL_POS + k], hit[BALL_VEL + k], hit[BALL_SPIN + k] = pos[k], vel[k], spin[k]
+    for j in range(7):
+        hit[JOINT_POS + j], hit[JOINT_VEL + j] = joints[j], rates[j]
+    hit[MOMENT] = moment
+
+
+@kernel
+def _correct(rallies: Rallies, b: int, motion: Motion, rules: Rules, now: int, is_hit: bool) -> None:
+    """Note which drives were at their limit; after a hit, find what the last actions should have differed by."""
+    limited = rallies.limited[b, now % BACK]
+    for k in range(motion.torque.shape[1]):
+        for j in range(7):
+            limited[k, j] = abs(motion.torque[b, k, j]) >= rules.torque_limit[j] * _AT_LIMIT
+    rallies.corrected[b] = 0
+    if is_hit and rules.corrects:
+        steps = min(now + 1, BACK)
+        late = int(rallies.condition[b, 11] / motion.step + 0.5)
+        if correction(
+            rallies.hit[b],
+            rallies.condition[b],
+            rules.flight_model,
+            rallies.limited[b],
+            now,
+            steps,
+            late,
+            rules.drives,
+            motion.step,
+            rallies.corrections[b],
+        ):
+            rallies.corrected[b] = steps
+
+
+@kernel
 def _fly_one(
     rallies: Rallies, b: int, motion: Motion, rules: Rules, noise: NoiseProfile, path: Array, step: Step
 ) -> Flown:
@@ -395,6 +480,9 @@ def _fly_one(
                 surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
                 if dot(sub(vel, surface_vel), normal) >= 0.0:
                     continue  # a graze that is over as it begins: no contact without approach
+                if rallies.hit.shape[0] > 0 and not rallies.caught[b]:
+                    rates = joint_rates_at(path, moment, motion.step)
+                    note_hit(rallies.hit[b], pos, vel, spin, joints, rates, moment)
                 before = vel
                 vel, spin = racket_bounce(
                     vel,
@@ -553,8 +641,11 @@ def play_step(
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
         copy_path(motion, b, path)
+        now = rallies.clock[b] // rules.grid_steps
         flown = _fly_one(rallies, b, motion, rules, noise, path, step)
         settle(rallies, b, flown, motion, actions, rules, noise, path, step)
+        if rallies.corrected.shape[0] > 0:
+            _correct(rallies, b, motion, rules, now, flown.hit)
 
 
 @kernel
@@ -572,7 +663,8 @@ def observe(
     rows: Integers,
     joint_pos: Array,
     joint_vel: Array,
-    spin: bool,
+    spin: int,
+    age: bool,
     privileged: bool,
     out: npt.NDArray[np.float32],
 ) -> None:
@@ -583,7 +675,8 @@ def observe(
         rows: Which.
         joint_pos: Joint positions now (B, 7).
         joint_vel: Joint velocities now (B, 7).
-        spin: Whether the policy is told the true spin.
+        spin: Which the policy is told: ``SPIN_HIDDEN``, ``SPIN_ESTIMATED`` or ``SPIN_TRUE``.
+        age: Whether it is told how old its sample is.
         privileged: Whether the critic's truth follows.
         out: Rows to write.
     """
@@ -609,10 +702,13 @@ def observe(
         for j in range(4):
             o[33 + j] = 1.0 if j == s else 0.0
         at = 37
-        if spin:
+        if spin != SPIN_HIDDEN:
             for j in range(3):
-                o[at + j] = rallies.ball[b, 6 + j]
+                o[at + j] = rallies.ball[b, 6 + j] if spin == SPIN_TRUE else rallies.track[b, SPIN + j]
             at += 3
+        if age:
+            o[at] = rallies.clock[b] * GRID_STEP - rallies.taken[b]
+            at += 1
         for earlier in range(rallies.earlier.shape[1]):
             for j in range(6):
                 o[at + j] = rallies.earlier[b, earlier, j]

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import UNVALIDATED, Episodes, PolicySnapshot, Rollout
-from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
+from common.env.rally_env import EnvConfig, EnvStep, FinishedRallies, RallyEnv, RallySource
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import PolicyError, new_network, observation_moments, task_hash, unpack
@@ -98,6 +98,7 @@ class Player:
         final_obs: list[Floats] = []
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
+        corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
         value_scale, value_mean = (
@@ -120,6 +121,7 @@ class Player:
             self._obs = step.obs
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated
             terms += step.terms.sum(axis=0)
+            correct(corrections, t, step)
             cut = step.truncated[step.ended]
             if cut.any():
                 final_obs.append(step.final_obs[cut])
@@ -149,8 +151,21 @@ class Player:
             rally_flags=flags,
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
+            corrections=np.where(np.abs(actions) < 1.0, corrections, 0.0),
             seconds=MappingProxyType({"inference": inference, "simulation": simulation}),
         )
+
+
+def correct(corrections: Floats, t: int, step: EnvStep) -> None:
+    """Write what step ``t`` says of the block's last actions into ``corrections`` (T, B, 7).
+
+    What reaches back beyond the block's beginning is lost: those frames are on their way.
+    """
+    for back in range(min(t + 1, step.corrections.shape[1])):
+        reached = step.corrected_steps > back
+        if not reached.any():
+            return
+        corrections[t - back, step.corrected[reached]] = step.corrections[reached, back]
 
 
 def _episodes(finished: list[FinishedRallies]) -> Episodes:

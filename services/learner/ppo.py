@@ -57,6 +57,12 @@ class PPOConfig(BaseModel):
         description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
         "CPU multiplies it natively",
     )
+    correction_weight: float = Field(
+        1000.0,
+        ge=0,
+        description="weight of the loss that draws the mean towards what the last actions before a hit should have "
+        "been; 0: PPO alone",
+    )
     refit_epochs: int = Field(
         24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
     )
@@ -77,6 +83,7 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
+    corrections: Tensor  # (N, A) what the mean should change by; 0 where nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +93,7 @@ class UpdateStats:
     policy_loss: float
     value_loss: float
     bound_loss: float
+    correction_loss: float
     entropy: float
     kl: float  # KL(prox, new), mean over the last pass: it steers the learning rate
     clip_fraction: float
@@ -110,6 +118,20 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     weight = torch.exp(log_prox - log_mu).clamp(max=MAX_WEIGHT).detach()
     clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
+
+
+def correction_loss(mean: Tensor, mean_prox: Tensor, corrections: Tensor) -> Tensor:
+    """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
+
+    The corrected are mean_prox + correction: how the policy that this update began with should have acted.
+
+    Args:
+        mean: (N, A).
+        mean_prox: (N, A).
+        corrections: (N, A); rows of zeros say nothing.
+    """
+    says = (corrections != 0.0).any(-1)
+    return 0.5 * ((mean - mean_prox - corrections).square().sum(-1) * says).mean()
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -171,7 +193,8 @@ def update(
     parameters = list(network.parameters())
     for parameter in network.policy_parameters():
         parameter.requires_grad_(not hold_policy)  # a frozen one has no gradient, and Adam leaves it alone
-    sums = np.zeros(5)
+    sums = np.zeros(6)
+    is_corrected = config.correction_weight > 0 and not hold_policy and bool((data.corrections != 0.0).any())
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
         for group in optimizer.param_groups:
@@ -193,6 +216,10 @@ def update(
             loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
             loss_bound = bound_loss(mean)
             loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
+            loss_correction = torch.zeros(())
+            if is_corrected:
+                loss_correction = correction_loss(mean, data.mean_prox[rows], data.corrections[rows])
+                loss = loss + config.correction_weight * loss_correction
             if config.entropy_weight > 0:
                 loss = loss - config.entropy_weight * entropy(network.log_sigma)
             optimizer.zero_grad(set_to_none=True)
@@ -211,6 +238,7 @@ def update(
                 loss_bound.item(),
                 outside.float().mean().item(),
                 norm,
+                loss_correction.item(),
             )
             breathe()
             kl_sum += kl
@@ -225,6 +253,7 @@ def update(
         policy_loss=float(means[0]),
         value_loss=float(means[1]),
         bound_loss=float(means[2]),
+        correction_loss=float(means[5]),
         entropy=float(entropy(network.log_sigma.detach())),
         kl=kl,
         clip_fraction=float(means[3]),

@@ -92,7 +92,8 @@ def make_data(network, count=512, seed=0):
         log_mu = log_prob(actions, mean, log_sigma)
     advantages = (actions[:, 0] - mean[:, 0]) * torch.sign(obs[:, 0])
     advantages = (advantages - advantages.mean()) / advantages.std()
-    return Dataset(obs, actions, log_mu, log_mu.clone(), mean, log_sigma, advantages, obs[:, 1].clone())
+    nothing = torch.zeros_like(mean)
+    return Dataset(obs, actions, log_mu, log_mu.clone(), mean, log_sigma, advantages, obs[:, 1].clone(), nothing)
 
 
 def test_an_update_moves_the_policy_where_the_advantage_points_and_fits_the_value():

@@ -1,0 +1,315 @@
+"""How the last actions should have been: what a hit teaches besides its reward.
+
+A reward says how good a stroke was; in simulation we can also say what was wrong with it. Contact, flight and drives
+are smooth and known, so near what happened the hit's result r depends on the last actions a as
+
+    r(a + d) = r(a) + L d,       L = dr/d(racket's path) . d(racket's path)/d(a)
+
+and the least change that would have led to what was wanted is d = L' (L L' + lambda)^-1 (wanted - r): a damped
+Gauss-Newton step (Levenberg 1944), one a hit. The learner draws the policy's mean there (``ppo.correction_loss``):
+iterative learning control (Arimoto 1984) with a network as its memory. Against the gradient of the same reward through
+the same physics (as in SHAC, Xu et al. 2022) such a step doesn't shout where the stroke is sensitive: the mean over a
+dataset has five times the signal to noise.
+
+Wanted of a hit: that the ball comes down on its target, clears the net by a margin, and meets the racket's centre.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from common.jit import kernel
+from common.physics.arm import Joints, point_velocity, racket_motion, racket_pose
+from common.physics.constants import BALL_RADIUS, NET_HEIGHT
+from common.physics.flight import flight_step
+from common.physics.racket_bounce import racket_bounce
+from common.physics.touch import racket_gap
+from common.physics.vec import Vec, axpy, dot, sub
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+BACK = 12  # control steps that a correction looks back over: 0.24 s at 50 Hz, twice the slowest drive's lag
+GOALS = 5  # landing x, y; place on the racket (2); height over the net
+_LANDING, _PLACE, _OVER = 0, 2, 4
+
+# Columns of a hit's row: the ball as it met the racket, the joints then, and when in the control step that was
+BALL_POS, BALL_VEL, BALL_SPIN, JOINT_POS, JOINT_VEL, MOMENT = 0, 3, 6, 9, 16, 23
+HIT = 24
+
+# Rows of the drives' table (5, 7)
+INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
+
+MARGIN = 0.10  # [m] that the ball should clear the net by
+LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear model says the direction only
+LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
+PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
+LEVENBERG = 1.0  # [m^2] lambda; L L' is some 25 m^2 per (unit of action)^2
+LARGEST_CORRECTION = 0.2  # [half-range] of one joint's target
+NO_NET = -1.0  # [m] height over the net of a ball that never gets there
+_FLIGHT_STEP, _LONGEST_FLIGHT = 0.010, 3.0  # [s]
+_DEEPEST = -0.7  # [m] below the table a ball that fell short isn't followed
+_SLOWEST_CLOSING = -0.5  # [m/s] slower contacts would be shifted too far in time
+_POS_STEP, _VEL_STEP = 1e-4, 1e-3  # of the differences [m, rad], [m/s, rad/s]
+_INSANE = 1e6  # results beyond this are no basis for a correction
+
+
+@kernel
+def _flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, float]:
+    """Return where a ball comes down to the table's height, x and y [m], and by how much it clears the net [m].
+
+    A ball that comes down before the net is followed on below the table: by how much it lacks height is known then.
+    """
+    over_net = NO_NET
+    x, y, is_down = pos[0], pos[1], False
+    for _ in range(math.ceil(_LONGEST_FLIGHT / _FLIGHT_STEP)):
+        before = pos
+        pos, vel = flight_step(pos, vel, spin, _FLIGHT_STEP, condition[0], condition[1], model)
+        if before[0] < 0.0 <= pos[0]:
+            share = -before[0] / (pos[0] - before[0])
+            over_net = before[2] + share * (pos[2] - before[2]) - NET_HEIGHT - BALL_RADIUS
+            if is_down:
+                break
+        if not is_down and pos[2] < BALL_RADIUS and vel[2] < 0.0:
+            share = (before[2] - BALL_RADIUS) / (before[2] - pos[2]) if before[2] > BALL_RADIUS else 0.0
+            x, y = before[0] + share * (pos[0] - before[0]), before[1] + share * (pos[1] - before[1])
+            is_down = True
+            if x > 0.0:
+                break
+        if pos[2] < _DEEPEST:
+            break
+    return x, y, over_net
+
+
+@kernel
+def hit_result(
+    q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int
+) -> tuple[float, float, float, float, float]:
+    """Return what a hit comes to: ``GOALS``.
+
+    The racket may stand a little off the ball (or in it): the contact is shifted to the moment at which they meet.
+
+    Args:
+        q: Joint positions at about the contact [m, rad].
+        qd: Joint velocities [m/s, rad/s].
+        pos: Ball then [m].
+        vel: Its velocity before the contact [m/s].
+        spin: [rad/s].
+        condition: The rally's ``noise.Condition`` (14,).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+
+    Returns:
+        Landing x, y [m]; offset from the racket's centre along its side and handle, times ``PLACE_WEIGHT`` [m]; height
+        over the net [m].
+    """
+    pose = racket_pose(q)
+    gap, normal = racket_gap(pos, pose)
+    racket_vel, racket_spin = racket_motion(q, qd)
+    surface = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
+    later = -gap / min(dot(sub(vel, surface), normal), _SLOWEST_CLOSING)
+    pos = axpy(later, vel, pos)
+    q = (
+        q[0] + later * qd[0],
+        q[1] + later * qd[1],
+        q[2] + later * qd[2],
+        q[3] + later * qd[3],
+        q[4] + later * qd[4],
+        q[5] + later * qd[5],
+        q[6] + later * qd[6],
+    )
+    pose = racket_pose(q)
+    _, normal = racket_gap(pos, pose)
+    racket_vel, racket_spin = racket_motion(q, qd)
+    surface = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
+    offset = sub(pos, pose.centre)
+    vel, spin = racket_bounce(
+        vel, spin, normal, surface, condition[4], condition[5], condition[6], condition[7], np.inf
+    )
+    x, y, over_net = _flies_to(pos, vel, spin, condition, model)
+    return x, y, PLACE_WEIGHT * dot(offset, pose.side), PLACE_WEIGHT * dot(offset, pose.up), over_net
+
+
+@kernel
+def _moved(q: Joints, joint: int, by: float) -> Joints:
+    """Return ``q`` with one number changed."""
+    return (
+        q[0] + (by if joint == 0 else 0.0),
+        q[1] + (by if joint == 1 else 0.0),
+        q[2] + (by if joint == 2 else 0.0),
+        q[3] + (by if joint == 3 else 0.0),
+        q[4] + (by if joint == 4 else 0.0),
+        q[5] + (by if joint == 5 else 0.0),
+        q[6] + (by if joint == 6 else 0.0),
+    )
+
+
+@kernel
+def _joints(hit: Array, at: int) -> Joints:
+    return (hit[at], hit[at + 1], hit[at + 2], hit[at + 3], hit[at + 4], hit[at + 5], hit[at + 6])
+
+
+@kernel
+def hit_sensitivity(
+    hit: Array, condition: Array, model: int, by_pos: Array, by_vel: Array
+) -> tuple[float, float, float, float, float]:
+    """Write how a hit's result depends on the joints at the contact, and return the result.
+
+    Args:
+        hit: (HIT,).
+        condition: (14,).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+        by_pos: (GOALS, 7) d result / d joint position; written.
+        by_vel: (GOALS, 7) d result / d joint velocity; written.
+    """
+    pos = (hit[0], hit[1], hit[2])
+    vel = (hit[3], hit[4], hit[5])
+    spin = (hit[6], hit[7], hit[8])
+    q, qd = _joints(hit, JOINT_POS), _joints(hit, JOINT_VEL)
+    result = hit_result(q, qd, pos, vel, spin, condition, model)
+    for joint in range(7):
+        moved = hit_result(_moved(q, joint, _POS_STEP), qd, pos, vel, spin, condition, model)
+        faster = hit_result(q, _moved(qd, joint, _VEL_STEP), pos, vel, spin, condition, model)
+        for goal in range(GOALS):
+            by_pos[goal, joint] = (moved[goal] - result[goal]) / _POS_STEP
+            by_vel[goal, joint] = (faster[goal] - result[goal]) / _VEL_STEP
+    return result
+
+
+@kernel
+def back_through_drives(
+    by_pos: Array,
+    by_vel: Array,
+    moment: float,
+    limited: Flags,
+    now: int,
+    steps: int,
+    late: int,
+    drives: Array,
+    h: float,
+    out: Array,
+) -> None:
+    """Write d result / d action for the control step of a contact and those before it.
+
+    Each joint on its own: inertia v' = k_p (target - q) - (k_v + d) v, stepped as MuJoCo's implicit integrator does;
+    where its force was at the limit it didn't feel the target. The adjoint recursion runs back from the contact.
+
+    Args:
+        by_pos: (7,) d result / d joint position at the contact.
+        by_vel: (7,) d result / d joint velocity.
+        moment: Of the contact, since its control step began [s].
+        limited: (BACK, n, 7) whether a drive was at its limit, by control step (a ring) and substep.
+        now: Number of the contact's control step: its row in the ring is now % BACK.
+        steps: How many control steps back the rally (or the ring) reaches, that one included.
+        late: Action latency [substeps]: that long into a control step the target before holds.
+        drives: (5, 7) inertia, k_p, k_v, joint damping, half-range of the targets.
+        h: MuJoCo's time step [s].
+        out: (BACK, 7) by control step, the contact's first; written.
+    """
+    substeps = limited.shape[1]
+    row = min(int(moment / h), substeps - 1)
+    for j in range(7):
+        inertia, stiffness, damping = drives[INERTIA, j], drives[STIFFNESS, j], drives[DAMPING, j]
+        slowed, driven = (
+            inertia + h * drives[JOINT_DAMPING, j],
+            inertia + h * (drives[JOINT_DAMPING, j] + damping),
+        )
+        for k in range(out.shape[0]):
+            out[k, j] = 0.0
+        # Positions between substeps are linear: q(moment) = q_row + (moment - row h) v_{row + 1}
+        on_q, on_v = by_pos[j], by_vel[j] + (moment - row * h) * by_pos[j]
+        for k in range(steps):
+            for s in range(row if k == 0 else substeps - 1, -1, -1):
+                if k > 0 or s < row:
+                    on_v += h * on_q  # q+ = q + h v+
+                if limited[(now - k) % limited.shape[0], s, j]:
+                    on_v *= inertia / slowed
+                    continue
+                pull = h * stiffness / driven * on_v
+                age = k + 1 if s < late else k
+                if age < out.shape[0]:
+                    out[age, j] += pull * drives[HALF_RANGE, j]
+                on_v *= inertia / driven
+                on_q -= pull
+
+
+@kernel
+def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> bool:
+    """Write d = L' (L L' + lambda)^-1 wanted; return whether it is any good.
+
+    Args:
+        sensitivity: L (GOALS, BACK, 7).
+        wanted: By how much the result should change (GOALS,).
+        goals: How many of them count, the first ones.
+        out: d (BACK, 7); written, each number within ``LARGEST_CORRECTION``.
+    """
+    steps, joints = out.shape
+    gram = np.empty((goals, goals))
+    for i in range(goals):
+        for j in range(goals):
+            total = LEVENBERG if i == j else 0.0
+            for k in range(steps):
+                for c in range(joints):
+                    total += sensitivity[i, k, c] * sensitivity[j, k, c]
+            if not abs(total) < _INSANE * _INSANE:
+                return False
+            gram[i, j] = total
+        if not abs(wanted[i]) < _INSANE:
+            return False
+    weights = np.linalg.solve(gram, wanted[:goals].copy())
+    for k in range(steps):
+        for c in range(joints):
+            change = 0.0
+            for i in range(goals):
+                change += sensitivity[i, k, c] * weights[i]
+            out[k, c] = min(max(change, -LARGEST_CORRECTION), LARGEST_CORRECTION)
+    return True
+
+
+@kernel
+def correction(
+    hit: Array,
+    condition: Array,
+    model: int,
+    limited: Flags,
+    now: int,
+    steps: int,
+    late: int,
+    drives: Array,
+    h: float,
+    out: Array,
+) -> bool:
+    """Write the least change of the last actions that would have taken a hit where it should go, linearised.
+
+    Args:
+        hit: (HIT,) ball and joints at the contact.
+        condition: (14,).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+        limited: See ``back_through_drives``, as the next four.
+        now: Number of the contact's control step.
+        steps: Control steps to look back over.
+        late: Action latency [substeps].
+        drives: (5, 7).
+        h: MuJoCo's time step [s].
+        out: (BACK, 7) [half-range] by control step, the contact's first; written.
+
+    Returns:
+        Whether there is a correction: not where a result isn't finite or beyond reason.
+    """
+    by_pos, by_vel = np.empty((GOALS, 7)), np.empty((GOALS, 7))
+    result = hit_sensitivity(hit, condition, model, by_pos, by_vel)
+    sensitivity = np.empty((GOALS, out.shape[0], 7))
+    for goal in range(GOALS):
+        back_through_drives(
+            by_pos[goal], by_vel[goal], hit[MOMENT], limited, now, steps, late, drives, h, sensitivity[goal]
+        )
+    wanted = np.empty(GOALS)
+    wanted[0], wanted[1] = condition[8] - result[0], condition[9] - result[1]
+    miss = math.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1])
+    if miss > LARGEST_MISS:
+        wanted[0] *= LARGEST_MISS / miss
+        wanted[1] *= LARGEST_MISS / miss
+    wanted[2], wanted[3] = -result[2], -result[3]
+    wanted[4] = min(MARGIN - result[4], LARGEST_SHORTFALL)
+    is_low = NO_NET < result[4] < MARGIN
+    return least_change(sensitivity, wanted, GOALS if is_low else GOALS - 1, out)
