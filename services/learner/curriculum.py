@@ -20,6 +20,14 @@ class CurriculumConfig(BaseModel):
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
     )
 
+    aiming_log_sigma: float = Field(
+        -2.5,
+        ge=-5,
+        le=1,
+        description="log of the action noise is at most this as stage 3 begins: a stroke that is to be corrected must "
+        "not drown in it",
+    )
+
     @property
     def epochs(self) -> int:
         """Return the whole budget [epochs]."""

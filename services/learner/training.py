@@ -226,6 +226,8 @@ class Training:
         health = before.health if is_refitting else watched(before.health, rate, self.guard)
         if changed:
             self.obs_moments = self.obs_moments.recounted()
+            if stage == 3:
+                self._calm(self.curriculum.aiming_log_sigma)
         self.progress = Progress(
             version=before.version + 1,
             epoch=before.epoch + 1,
@@ -250,6 +252,12 @@ class Training:
         weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
         for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(newest, weight)
+
+    @torch.no_grad()
+    def _calm(self, log_sigma: float) -> None:
+        """Let the action noise be no larger than this from now on."""
+        for network in (self.network, self.average):
+            network.log_sigma.clamp_(max=log_sigma)
 
     def forget_health(self) -> None:
         """Judge the stage's rate anew from now on."""
