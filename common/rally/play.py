@@ -25,7 +25,7 @@ from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
-from common.rally.camera import READ, SHOT, SHOTS, TAKEN, begin_film, film_flight
+from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot_row
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_FLIGHT, heading
@@ -66,10 +66,9 @@ class Rallies(NamedTuple):
     head: Integers  # (B,)
     seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
     earlier: Array  # (B, history, 6) what it went by one, two ... control steps ago
-    shots: Array  # (B, SHOTS, 5) the simulated camera's shots; the four with no rows: perception is cheap
-    shot_counts: Integers  # (B, 3) camera.NEXT, TAKEN, READ
-    shot_due: Array  # (B, 1) [s since launch] when the next shot will be taken
-    estimate: Array  # (B, ESTIMATE) what the estimator makes of the shots that have arrived
+    # (B, FILM + ESTIMATE) the simulated camera's film and what the estimator makes of it; no rows: perception is cheap.
+    # One array, not several: with four, every step of every rally took twice as long, camera or not
+    eyes: Array
     last_action: Array  # (B, 7)
 
 
@@ -147,10 +146,7 @@ def allocate(count: int, history: int = 0, full: bool = False) -> tuple[Rallies,
         head=np.zeros(count, np.int64),
         seen=np.zeros((count, SAMPLE)),
         earlier=np.zeros((count, history, 6)),
-        shots=np.zeros((filmed, SHOTS, SHOT)),
-        shot_counts=np.zeros((filmed, 3), np.int64),
-        shot_due=np.zeros((filmed, 1)),
-        estimate=np.zeros((filmed, ESTIMATE)),
+        eyes=np.zeros((filmed, FILM + ESTIMATE)),
         last_action=np.zeros((count, 7)),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
@@ -194,18 +190,18 @@ def _estimate(rallies: Rallies, b: int, noise: NoiseProfile) -> None:
     """
     now = rallies.clock[b] * GRID_STEP
     latency = rallies.condition[b, 10] * GRID_STEP
-    shots, counts, row = rallies.shots[b], rallies.shot_counts[b], rallies.estimate[b]
-    while counts[READ] < counts[TAKEN]:
-        shot = shots[counts[READ] % SHOTS]
+    film, row = rallies.eyes[b, :FILM], rallies.eyes[b, FILM:]
+    while film[READ] < film[TAKEN]:
+        shot = shot_row(film, int(film[READ]))
         pos = (shot[1], shot[2], shot[3])
-        if counts[READ] == 0:  # the launch itself is in view
+        if film[READ] == 0.0:  # the launch itself is in view
             begin_estimate(row, shot[0], pos, noise.camera_noise)
             shot[4] = 1.0
         elif shot[0] + latency > now + 1e-9:
             break
         elif take_shot(row, shot[0], pos, noise.camera_noise):
             shot[4] = 1.0
-        counts[READ] += 1
+        film[READ] += 1.0
     usual = 0.5 * (noise.observation_latency[0] + noise.observation_latency[1])
     pos, vel, state = estimate_at(row, max(now - usual, 0.0))
     seen = rallies.seen[b]
@@ -221,7 +217,7 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     for k in range(earlier.shape[0] - 1, -1, -1):
         for j in range(6):
             earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
-    if rallies.estimate.shape[0] > 0:
+    if rallies.eyes.shape[0] > 0:
         _estimate(rallies, b, noise)
     else:
         _sample(rallies, b, step, noise)
@@ -254,9 +250,8 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
         for k in range(6):
             rallies.camera[b, row, k] = record[k]
         rallies.camera[b, row, 6] = 0.0
-    if rallies.estimate.shape[0] > 0:
-        pos = (record[0], record[1], record[2])
-        begin_film(rallies.shots[b], rallies.shot_counts[b], rallies.shot_due[b], seed, pos, noise)
+    if rallies.eyes.shape[0] > 0:
+        begin_film(rallies.eyes[b, :FILM], seed, (record[0], record[1], record[2]), noise)
     _look(rallies, b, 0, noise)
     for k in range(rallies.earlier.shape[1]):
         for j in range(6):
@@ -294,7 +289,7 @@ def judge(rallies: Rallies, b: int, state: int, what: int, pos: Vec, rules: Rule
 def shoot(
     rallies: Rallies, b: int, noise: NoiseProfile, since: float, p0: Vec, v0: Vec, h: float, p1: Vec, v1: Vec
 ) -> None:
-    """Let the camera film a piece of ball b's flight without touches, if there is a camera.
+    """Let the camera film a piece of ball b's flight without touches; only where there is a camera.
 
     Args:
         rallies: Row b is written.
@@ -307,21 +302,18 @@ def shoot(
         p1: Position at its end [m].
         v1: Velocity at its end, before any bounce [m/s].
     """
-    if rallies.shots.shape[0] > 0:
-        film_flight(
-            rallies.shots[b],
-            rallies.shot_counts[b],
-            rallies.shot_due[b],
-            rallies.seed[b],
-            rallies.condition[b],
-            noise,
-            rallies.clock[b] * GRID_STEP + since,
-            p0,
-            v0,
-            h,
-            p1,
-            v1,
-        )
+    film_flight(
+        rallies.eyes[b, :FILM],
+        rallies.seed[b],
+        rallies.condition[b],
+        noise,
+        rallies.clock[b] * GRID_STEP + since,
+        p0,
+        v0,
+        h,
+        p1,
+        v1,
+    )
 
 
 @kernel
@@ -354,6 +346,7 @@ def _fly_one(
     ball, condition = rallies.ball[b], rallies.condition[b]
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
     state = rallies.state[b]
+    filmed = rallies.eyes.shape[0] > 0
     outcome = 0
     bounced, hit, landed = False, False, False
     racket_speed = 0.0
@@ -378,7 +371,8 @@ def _fly_one(
                 motion.step,
                 fastest,
             )
-            shoot(rallies, b, noise, GRID_STEP - rest, p0, v0, flown, pos, vel)
+            if filmed:
+                shoot(rallies, b, noise, GRID_STEP - rest, p0, v0, flown, pos, vel)
             rest -= flown
             if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:
                 rallies.over[b] = True
