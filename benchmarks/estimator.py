@@ -24,7 +24,7 @@ from common.env.rally_env import EnvConfig, RallyEnv
 from common.jit import kernel
 from common.physics.constants import GRID_STEP
 from common.policy.weights import load_policy
-from common.rally.camera import READ, SHOTS
+from common.rally.camera import FILM, FIRST_SHOT, READ, SHOT, SHOTS
 from common.rally.estimator import TOUCH, estimate_at
 from common.rally.launch import draw_rallies
 from common.rally.noise import PROFILES
@@ -58,7 +58,7 @@ class Watched:
 @kernel
 def _estimates_now(rallies: Rallies, out: Array) -> None:
     for b in range(out.shape[0]):
-        pos, vel, state = estimate_at(rallies.estimate[b], rallies.clock[b] * GRID_STEP)
+        pos, vel, state = estimate_at(rallies.eyes[b, FILM:], rallies.clock[b] * GRID_STEP)
         for k in range(3):
             out[b, k], out[b, 3 + k] = pos[k], vel[k]
         out[b, 6] = state
@@ -96,9 +96,10 @@ def quadratic_fit(times: Array, positions: Array, now: Array) -> Array:
 
 def windows(rallies: Rallies, length: int) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
     """Return each ball's newest shots that have arrived (B, W), (B, W, 3), and which of them the estimator believed."""
-    read = rallies.shot_counts[:, READ]
+    read = rallies.eyes[:, READ].astype(np.int64)
+    film = rallies.eyes[:, FIRST_SHOT:FILM].reshape(len(read), SHOTS, SHOT)
     index = read[:, None] - length + np.arange(length)
-    shots = rallies.shots[np.arange(len(read))[:, None], index % SHOTS]
+    shots = film[np.arange(len(read))[:, None], index % SHOTS]
     times = np.where(index >= 0, shots[:, :, 0], np.nan)
     return times, shots[:, :, 1:4], shots[:, :, 4] > 0.0
 
@@ -134,7 +135,7 @@ def watch(envs: int, rallies: int, window: int, seed: int, noise: str, policy_fo
         _estimates_now(env.rallies, found)
         times, positions, believed = windows(env.rallies, window)
         plain = differentiated(times, positions, now)
-        since_touch = believed & (times > env.rallies.estimate[:, TOUCH, None])
+        since_touch = believed & (times > env.rallies.eyes[:, FILM + TOUCH, None])
         fitted = quadratic_fit(np.where(since_touch, times, np.nan), positions, now)
         keep = env.validated & (env.rallies.clock > 0)
         state_now: Array = (env.rallies.state[:, None] // 2).astype(np.float64)

@@ -17,6 +17,7 @@ class Collision(Protocol):
     """Robots, and how balls move among them. Rules, reward and what is seen are the same for all."""
 
     robot: RobotBatch
+    motion: play.Motion  # of the robots in the last step
 
     def launch(self, rallies: play.Rallies, rows: Rows) -> None:
         """Take over the balls of ``rows``, which were launched just now."""
@@ -40,5 +41,6 @@ class TailoredCollision:
         self, rallies: play.Rallies, actions: Array, rules: play.Rules, noise: NoiseProfile, step: play.Step
     ) -> None:
         """Play one control step; the ball's impulse on the racket acts in the next one."""
-        play.play_step(rallies, self.robot.step(actions), actions, rules, noise, step)
+        self.motion = self.robot.step(actions)
+        play.play_step(rallies, self.motion, actions, rules, noise, step)
         self.robot.push_racket(step.impulse)

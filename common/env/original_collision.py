@@ -227,6 +227,7 @@ def _follow(
     bounced, hit, landed = False, False, False
     racket_speed = 0.0
     per_grid_step = qpos.shape[0] // rules.grid_steps
+    filmed = rallies.eyes.shape[0] > 0
     for k in range(qpos.shape[0]):
         for obstacle in range(found.shape[1]):
             is_new = found[k, obstacle] > 0.0 and free[obstacle] > FREE_SUBSTEPS
@@ -249,7 +250,10 @@ def _follow(
             p, v, w = qpos[k, _BALL_POS:], qvel[k, _BALL_VEL:], qvel[k, _BALL_SPIN:]
             p0, v0 = pos, vel
             pos, vel = (p[0], p[1], p[2]), (v[0], v[1], v[2])
-            play.shoot(rallies, b, noise, (k % per_grid_step) * motion.step, p0, v0, motion.step, pos, vel)
+            if filmed:
+                play.shoot(
+                    rallies, b, noise, (k % per_grid_step) * motion.step, p0, v0, motion.step, pos, vel
+                )
             spin = _turned(qpos[k, _BALL_TURN:], (w[0], w[1], w[2]))
             if abs(pos[0]) > touch.PLAY_X or abs(pos[1]) > touch.PLAY_Y:
                 state, outcome = play.judge(rallies, b, state, _OUT, pos, rules)
@@ -308,7 +312,7 @@ class OriginalCollision:
         """Play one control step; the ball pushes the racket in MuJoCo itself."""
         motion = self._simulation.step(actions)
         records = self._simulation.records
-        robot_motion = motion._replace(
+        robot_motion = self.motion = motion._replace(
             joint_pos=records["qpos"][:, :, :7], contact=records["sensordata"][:, :, :_ROBOT_SENSORS]
         )
         found = records["sensordata"][:, :, _ROBOT_SENSORS:]

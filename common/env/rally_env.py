@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.env.collision import Collision, TailoredCollision
 from common.env.original_collision import OriginalCollision, RobotAndBall
+from common.env.review import NO_LESSONS, Lessons, Review
 from common.env.robot import RobotBatch, RobotPreset
 from common.jit import kernel
 from common.physics.constants import GRID_STEP
@@ -126,11 +127,7 @@ class EnvStep:
     final_obs: Floats  # (n, D) the last observation of each of ``ended``
     terms: Array  # (B, 8) reward.TERMS
     finished: FinishedRallies
-    corrected: Rows  # (n,) balls that were hit, and whose hit says what the last actions should have been
-    corrections: (
-        Floats  # (n, BACK, 7) by what those differed from it, this step's first: hindsight.correction
-    )
-    corrected_steps: Rows  # (n,) how many steps back that reaches within the rally
+    lessons: Lessons  # what hits of this step say about the last actions
 
 
 @kernel
@@ -184,15 +181,13 @@ class RallyEnv:
         self.noise = PROFILES[config.noise]
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
-        # MuJoCo's own contact has no law that could be differentiated.
-        self._corrects = config.hindsight and config.collision == "tailored"
-        self._drives = self.robot.drives
+        self._review = self._make_review()
         self._rallies, self._step = play.allocate(
             count,
             config.observation.history,
             full=config.perception == "full",
             tracked=config.observation.spin == "estimated",
-            corrected_substeps=self.robot.substeps if self._corrects else 0,
+            reviewed=self._review is not None,
         )
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
@@ -224,8 +219,6 @@ class RallyEnv:
             grid_steps=round(1.0 / (config.control_rate_hz * GRID_STEP)),
             time_limit=config.time_limit_s,
             flight_model=self._flight_model,
-            corrects=self._corrects and stage == 3,
-            drives=self._drives,
         )
 
     @property
@@ -275,9 +268,9 @@ class RallyEnv:
         terminated[ended] = True
         terminated &= ~truncated
         final_obs = self._obs[ended]
-        corrected = np.flatnonzero(self._rallies.corrected)
-        corrections = self._rallies.corrections[corrected].astype(np.float32)
-        corrected_steps = self._rallies.corrected[corrected]
+        lessons = NO_LESSONS
+        if self._review is not None:
+            lessons = self._review.look(self._rallies, self._collision.motion, self.stage == 3)
         finished = self._finish(over)
         if over.size:
             self._begin(over, goes_on)
@@ -291,9 +284,7 @@ class RallyEnv:
             final_obs=final_obs,
             terms=self._step.terms.copy(),
             finished=finished,
-            corrected=corrected,
-            corrections=corrections,
-            corrected_steps=corrected_steps,
+            lessons=lessons,
         )
 
     def _make_collision(self, threads: int) -> Collision:
@@ -301,6 +292,12 @@ class RallyEnv:
         if self.config.collision == "original":
             return OriginalCollision(RobotAndBall(self.count, preset, rate, self._flight_model, threads))
         return TailoredCollision(RobotBatch(self.count, preset, rate, threads=threads))
+
+    def _make_review(self) -> Review | None:
+        """Return who corrects hits; MuJoCo's own contact has no law to differentiate."""
+        if not self.config.hindsight or self.config.collision == "original":
+            return None
+        return Review(self.robot, self._flight_model)
 
     def _observe(self, rows: Rows) -> None:
         """Write the observations of ``rows``."""

@@ -16,7 +16,6 @@ from common.rally.draws import Stream, between, normal_pair, uniform
 from common.rally.noise import NoiseProfile
 
 Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 MAX_RATE_HZ: Final = (
     200.0  # [Hz] with SHOTS: the latest 40 ms of latency and of a control step fit, twice over
@@ -25,7 +24,11 @@ SHOTS: Final = 32  # shots kept, newest over oldest
 SHOT: Final = (
     5  # numbers in a shot: time stamp [s since launch], position [m], 1 if the estimator believed it
 )
-NEXT, TAKEN, READ = 0, 1, 2  # counters: index of the next shot, shots kept so far, shots that have arrived
+
+# A ball's film is one row of numbers: index of the next shot, shots kept so far, shots of these that have arrived,
+# when the next will be taken [s since launch], and the shots
+NEXT, TAKEN, READ, DUE, FIRST_SHOT = 0, 1, 2, 3, 4
+FILM: Final = FIRST_SHOT + SHOTS * SHOT  # numbers in a row
 
 # A shot's moment keeps to its own share of the period, so that shots never change places
 _MOST_JITTER: Final = 0.45  # [period]
@@ -58,28 +61,31 @@ def shot_position(seed: int, shot: int, pos: Vec, noise: NoiseProfile) -> Vec:
 
 
 @kernel
-def begin_film(shots: Array, counts: Integers, due: Array, seed: int, pos: Vec, noise: NoiseProfile) -> None:
+def shot_row(film: Array, shot: int) -> Array:
+    """Return the numbers (5,) of the ``shot``-th that was kept, as a view; only the last 32 are still there."""
+    first = FIRST_SHOT + SHOT * (shot % SHOTS)
+    return film[first : first + SHOT]
+
+
+@kernel
+def begin_film(film: Array, seed: int, pos: Vec, noise: NoiseProfile) -> None:
     """Take the shot that a rally begins with: the ball is in view as it is launched, and no shot of it is lost.
 
     Args:
-        shots: Of one ball (SHOTS, 5); written.
-        counts: Of one ball (3,); written.
-        due: When its next shot will be taken (1,); written.
+        film: Of one ball (FILM,); written.
         seed: The rally's.
         pos: Of the launch [m].
         noise: Profile.
     """
-    counts[NEXT], counts[TAKEN], counts[READ] = 1, 1, 0
-    seen = shot_position(seed, 0, pos, noise)
-    shots[0, 0], shots[0, 1], shots[0, 2], shots[0, 3] = 0.0, seen[0], seen[1], seen[2]
-    due[0] = shot_moment(seed, 1, noise)
+    film[NEXT], film[TAKEN], film[READ] = 1.0, 1.0, 0.0
+    film[DUE] = shot_moment(seed, 1, noise)
+    seen, row = shot_position(seed, 0, pos, noise), shot_row(film, 0)
+    row[0], row[1], row[2], row[3], row[4] = 0.0, seen[0], seen[1], seen[2], 0.0
 
 
 @kernel
 def film_flight(
-    shots: Array,
-    counts: Integers,
-    due: Array,
+    film: Array,
     seed: int,
     condition: Array,
     noise: NoiseProfile,
@@ -93,9 +99,7 @@ def film_flight(
     """Take the shots that fall into a piece of flight without touches.
 
     Args:
-        shots: Of one ball (SHOTS, 5); written.
-        counts: Of one ball (3,); written.
-        due: When its next shot will be taken (1,); written.
+        film: Of one ball (FILM,); written.
         seed: The rally's.
         condition: ``noise.Condition`` of the rally (14,).
         noise: Profile.
@@ -106,10 +110,10 @@ def film_flight(
         p1: Position at its end.
         v1: Velocity at its end, before any bounce.
     """
-    while due[0] <= start + h:
-        moment, shot = due[0], counts[NEXT]
-        counts[NEXT] += 1
-        due[0] = shot_moment(seed, shot + 1, noise)
+    while film[DUE] <= start + h:
+        moment, shot = film[DUE], int(film[NEXT])
+        film[NEXT] += 1.0
+        film[DUE] = shot_moment(seed, shot + 1, noise)
         in_burst = condition[12] <= moment < condition[13]
         if in_burst or uniform(seed, _SHOT, 8 * shot + 6) < noise.loss:
             continue
@@ -117,6 +121,6 @@ def film_flight(
         if h > 0.0:
             pos = path_at(p0, v0, p1, v1, h, max(moment - start, 0.0))
         seen = shot_position(seed, shot, pos, noise)
-        row = shots[counts[TAKEN] % SHOTS]
+        row = shot_row(film, int(film[TAKEN]))
         row[0], row[1], row[2], row[3], row[4] = moment, seen[0], seen[1], seen[2], 0.0
-        counts[TAKEN] += 1
+        film[TAKEN] += 1.0

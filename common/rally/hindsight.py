@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.arm import Joints, point_velocity, racket_motion, racket_pose
-from common.physics.constants import BALL_RADIUS, NET_HEIGHT
+from common.physics.constants import BALL_RADIUS, NET_HEIGHT, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
@@ -34,14 +34,18 @@ BACK = 12  # control steps that a correction looks back over: 0.24 s at 50 Hz, t
 GOALS = 5  # landing x, y; place on the racket (2); height over the net
 _LANDING, _PLACE, _OVER = 0, 2, 4
 
-# Columns of a hit's row: the ball as it met the racket, the joints then, and when in the control step that was
+# Columns of a hit's row: the ball as it met the racket, the joints then, and when in its control step that was [s]
 BALL_POS, BALL_VEL, BALL_SPIN, JOINT_POS, JOINT_VEL, MOMENT = 0, 3, 6, 9, 16, 23
-HIT = 24
+STEP = 24  # number of that control step in the rally, from 0
+FRESH = 25  # 1: it was in the newest control step
+HIT = 26
 
 # Rows of the drives' table (5, 7)
 INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
 
 MARGIN = 0.10  # [m] that the ball should clear the net by
+EDGE = 0.15  # [m] a target nearer to the table's edge than this is aimed at from inside: what misses a little returns
+NEAREST = 0.25  # [m] from the net on that balls are aimed to
 LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear model says the direction only
 LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
@@ -53,6 +57,18 @@ _DEEPEST = -0.7  # [m] below the table a ball that fell short isn't followed
 _SLOWEST_CLOSING = -0.5  # [m/s] slower contacts would be shifted too far in time
 _POS_STEP, _VEL_STEP = 1e-4, 1e-3  # of the differences [m, rad], [m/s, rad/s]
 _INSANE = 1e6  # results beyond this are no basis for a correction
+
+
+@kernel
+def note_hit(
+    hit: Array, pos: Vec, vel: Vec, spin: Vec, joints: Joints, rates: Joints, moment: float, step: int
+) -> None:
+    """Write ball and joints at a contact into a hit's row (HIT,)."""
+    for k in range(3):
+        hit[BALL_POS + k], hit[BALL_VEL + k], hit[BALL_SPIN + k] = pos[k], vel[k], spin[k]
+    for j in range(7):
+        hit[JOINT_POS + j], hit[JOINT_VEL + j] = joints[j], rates[j]
+    hit[MOMENT], hit[STEP], hit[FRESH] = moment, step, 1.0
 
 
 @kernel
@@ -182,7 +198,7 @@ def back_through_drives(
     by_vel: Array,
     moment: float,
     limited: Flags,
-    now: int,
+    newest: int,
     steps: int,
     late: int,
     drives: Array,
@@ -199,7 +215,7 @@ def back_through_drives(
         by_vel: (7,) d result / d joint velocity.
         moment: Of the contact, since its control step began [s].
         limited: (BACK, n, 7) whether a drive was at its limit, by control step (a ring) and substep.
-        now: Number of the contact's control step: its row in the ring is now % BACK.
+        newest: The ring's row of the contact's control step.
         steps: How many control steps back the rally (or the ring) reaches, that one included.
         late: Action latency [substeps]: that long into a control step the target before holds.
         drives: (5, 7) inertia, k_p, k_v, joint damping, half-range of the targets.
@@ -222,7 +238,7 @@ def back_through_drives(
             for s in range(row if k == 0 else substeps - 1, -1, -1):
                 if k > 0 or s < row:
                     on_v += h * on_q  # q+ = q + h v+
-                if limited[(now - k) % limited.shape[0], s, j]:
+                if limited[(newest - k) % limited.shape[0], s, j]:
                     on_v *= inertia / slowed
                     continue
                 pull = h * stiffness / driven * on_v
@@ -272,7 +288,7 @@ def correction(
     condition: Array,
     model: int,
     limited: Flags,
-    now: int,
+    newest: int,
     steps: int,
     late: int,
     drives: Array,
@@ -286,7 +302,7 @@ def correction(
         condition: (14,).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
         limited: See ``back_through_drives``, as the next four.
-        now: Number of the contact's control step.
+        newest: The ring's row of the contact's control step.
         steps: Control steps to look back over.
         late: Action latency [substeps].
         drives: (5, 7).
@@ -301,10 +317,20 @@ def correction(
     sensitivity = np.empty((GOALS, out.shape[0], 7))
     for goal in range(GOALS):
         back_through_drives(
-            by_pos[goal], by_vel[goal], hit[MOMENT], limited, now, steps, late, drives, h, sensitivity[goal]
+            by_pos[goal],
+            by_vel[goal],
+            hit[MOMENT],
+            limited,
+            newest,
+            steps,
+            late,
+            drives,
+            h,
+            sensitivity[goal],
         )
     wanted = np.empty(GOALS)
-    wanted[0], wanted[1] = condition[8] - result[0], condition[9] - result[1]
+    wanted[0] = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE) - result[0]
+    wanted[1] = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE) - result[1]
     miss = math.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1])
     if miss > LARGEST_MISS:
         wanted[0] *= LARGEST_MISS / miss
@@ -313,3 +339,38 @@ def correction(
     wanted[4] = min(MARGIN - result[4], LARGEST_SHORTFALL)
     is_low = NO_NET < result[4] < MARGIN
     return least_change(sensitivity, wanted, GOALS if is_low else GOALS - 1, out)
+
+
+@kernel
+def corrections(
+    hits: Array,
+    conditions: Array,
+    model: int,
+    limited: Flags,
+    newest: int,
+    drives: Array,
+    h: float,
+    out: Array,
+    steps: npt.NDArray[np.int64],
+) -> None:
+    """Correct every fresh hit of B robots.
+
+    Args:
+        hits: (B, HIT).
+        conditions: ``noise.Condition`` of the rallies (B, 14).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+        limited: (B, BACK, n, 7) whether a drive was at its limit, by control step (a ring) and substep.
+        newest: The ring's row of the newest control step.
+        drives: (5, 7).
+        h: MuJoCo's time step [s].
+        out: (B, BACK, 7); rows of fresh hits are written.
+        steps: (B,) how many control steps back a correction reaches; 0 where there is none; written.
+    """
+    for b in range(hits.shape[0]):
+        steps[b] = 0
+        if hits[b, FRESH] == 0.0:
+            continue
+        reach = min(int(hits[b, STEP]) + 1, BACK)
+        late = int(conditions[b, 11] / h + 0.5)
+        if correction(hits[b], conditions[b], model, limited[b], newest, reach, late, drives, h, out[b]):
+            steps[b] = reach

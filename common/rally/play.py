@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.arm import (
-    Joints,
     joint_rates_at,
     joints_at,
     point_velocity,
@@ -26,21 +25,11 @@ from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
-from common.rally.camera import READ, SHOT, SHOTS, TAKEN, begin_film, film_flight
+from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot_row
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
-from common.rally.hindsight import (
-    BACK,
-    BALL_POS,
-    BALL_SPIN,
-    BALL_VEL,
-    HIT,
-    JOINT_POS,
-    JOINT_VEL,
-    MOMENT,
-    correction,
-)
+from common.rally.hindsight import FRESH, HIT, note_hit
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.spin_estimate import BOUNCED, SPIN, TRACK, begin_track, follow, turn_at_bounce
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
@@ -53,8 +42,8 @@ SAMPLE = 7  # numbers in a camera sample: position, velocity, trajectory state 0
 CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty saturates
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
+_TAKEN = SAMPLE  # column of ``Rallies.seen``
 SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
-_AT_LIMIT = 1.0 - 1e-9  # [-] share of a drive's largest force from which on it is at its limit
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -79,21 +68,15 @@ class Rallies(NamedTuple):
     landing_error: Array  # (B,) [m] planar distance of that to the target
     camera: Array  # (B, RING, 7) true samples on the grid, newest at ``head``
     head: Integers  # (B,)
-    seen: Array  # (B, 7) the sample that the robot goes by: late, noisy, sometimes held
+    # (B, 8) the sample that the robot goes by: late, noisy, sometimes held; and when it was taken [s since launch]
+    seen: Array
     earlier: Array  # (B, history, 6) what it went by one, two ... control steps ago
-    shots: Array  # (B, SHOTS, 5) the simulated camera's shots; the four with no rows: perception is cheap
-    shot_counts: Integers  # (B, 3) camera.NEXT, TAKEN, READ
-    shot_due: Array  # (B, 1) [s since launch] when the next shot will be taken
-    estimate: Array  # (B, ESTIMATE) what the estimator makes of the shots that have arrived
-    taken: Array  # (B,) when that sample was taken, since launch [s]: samples carry a time stamp
+    # (B, FILM + ESTIMATE) the simulated camera's film and what the estimator makes of it; no rows: perception is cheap.
+    # One array, not several: with four, every step of every rally took twice as long, camera or not
+    eyes: Array
     track: Array  # (B, TRACK) what the samples tell of the spin; no rows: nobody asks
+    hit: Array  # (B, HIT) ball and joints at the last legal contact; no rows: nobody asks
     last_action: Array  # (B, 7)
-    hit: Array  # (B, HIT) ball and joints at the contact; the four with no rows: hits are not corrected
-    limited: npt.NDArray[
-        np.bool_
-    ]  # (B, BACK, n, 7) drives at their limit, by control step (a ring) and substep
-    corrections: Array  # (B, BACK, 7) what the last actions should have differed by, the contact's step first
-    corrected: Integers  # (B,) over how many steps back, where a correction was found in this step; else 0
 
 
 class Motion(NamedTuple):
@@ -122,8 +105,6 @@ class Rules(NamedTuple):
     grid_steps: int  # a control step
     time_limit: float  # [s] a rally
     flight_model: int
-    corrects: bool  # whether hits are corrected in this stage
-    drives: Array  # (5, 7) ``hindsight``'s table of the robot's drives
 
 
 class Step(NamedTuple):
@@ -150,7 +131,7 @@ class Flown(NamedTuple):
 
 
 def allocate(
-    count: int, history: int = 0, full: bool = False, tracked: bool = False, corrected_substeps: int = 0
+    count: int, history: int = 0, full: bool = False, tracked: bool = False, reviewed: bool = False
 ) -> tuple[Rallies, Step]:
     """Return zeroed rows for ``count`` rallies.
 
@@ -159,9 +140,8 @@ def allocate(
         history: How many earlier samples are remembered.
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
         tracked: Whether spin is estimated.
-        corrected_substeps: MuJoCo's substeps a control step, where hits are corrected; 0: they aren't.
+        reviewed: Whether contacts are kept, for ``hindsight``.
     """
-    filmed, corrected = count if full else 0, count if corrected_substeps else 0
     rallies = Rallies(
         ball=np.zeros((count, 9)),
         state=np.zeros(count, np.int64),
@@ -177,19 +157,12 @@ def allocate(
         landing_error=np.full(count, np.nan),
         camera=np.zeros((count, RING, SAMPLE)),
         head=np.zeros(count, np.int64),
-        seen=np.zeros((count, SAMPLE)),
+        seen=np.zeros((count, SAMPLE + 1)),
         earlier=np.zeros((count, history, 6)),
-        shots=np.zeros((filmed, SHOTS, SHOT)),
-        shot_counts=np.zeros((filmed, 3), np.int64),
-        shot_due=np.zeros((filmed, 1)),
-        estimate=np.zeros((filmed, ESTIMATE)),
-        taken=np.zeros(count),
+        eyes=np.zeros((count if full else 0, FILM + ESTIMATE)),
         track=np.zeros((count if tracked else 0, TRACK)),
+        hit=np.zeros((count if reviewed else 0, HIT)),
         last_action=np.zeros((count, 7)),
-        hit=np.zeros((corrected, HIT)),
-        limited=np.zeros((corrected, BACK, corrected_substeps, 7), np.bool_),
-        corrections=np.zeros((corrected, BACK, 7)),
-        corrected=np.zeros(corrected, np.int64),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
     return rallies, step
@@ -204,9 +177,9 @@ def _sample(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     in_burst = condition[12] <= moment < condition[13]
     if step > 0 and (in_burst or uniform(seed, _CAMERA, 8 * step) < noise.loss):
         return
-    rallies.taken[b] = max(moment - condition[10] * GRID_STEP, 0.0)
     row = (rallies.head[b] + RING - int(condition[10])) % RING
     seen = rallies.seen[b]
+    seen[_TAKEN] = max(moment - condition[10] * GRID_STEP, 0.0)
     sample = rallies.camera[b, row]
     if noise.position_noise == 0.0 and noise.velocity_noise == 0.0:
         for k in range(6):
@@ -233,22 +206,22 @@ def _estimate(rallies: Rallies, b: int, noise: NoiseProfile) -> None:
     """
     now = rallies.clock[b] * GRID_STEP
     latency = rallies.condition[b, 10] * GRID_STEP
-    shots, counts, row = rallies.shots[b], rallies.shot_counts[b], rallies.estimate[b]
-    while counts[READ] < counts[TAKEN]:
-        shot = shots[counts[READ] % SHOTS]
+    film, row = rallies.eyes[b, :FILM], rallies.eyes[b, FILM:]
+    while film[READ] < film[TAKEN]:
+        shot = shot_row(film, int(film[READ]))
         pos = (shot[1], shot[2], shot[3])
-        if counts[READ] == 0:  # the launch itself is in view
+        if film[READ] == 0.0:  # the launch itself is in view
             begin_estimate(row, shot[0], pos, noise.camera_noise)
             shot[4] = 1.0
         elif shot[0] + latency > now + 1e-9:
             break
         elif take_shot(row, shot[0], pos, noise.camera_noise):
             shot[4] = 1.0
-        counts[READ] += 1
+        film[READ] += 1.0
     usual = 0.5 * (noise.observation_latency[0] + noise.observation_latency[1])
-    rallies.taken[b] = max(now - usual, 0.0)
-    pos, vel, state = estimate_at(row, rallies.taken[b])
     seen = rallies.seen[b]
+    seen[_TAKEN] = max(now - usual, 0.0)
+    pos, vel, state = estimate_at(row, seen[_TAKEN])
     for k in range(3):
         seen[k], seen[3 + k] = pos[k], vel[k]
     seen[6] = state
@@ -261,17 +234,18 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     for k in range(earlier.shape[0] - 1, -1, -1):
         for j in range(6):
             earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
-    last = rallies.seen[b].copy()
-    if rallies.estimate.shape[0] > 0:
+    seen = rallies.seen[b]
+    last = (seen[3], seen[4], seen[5])
+    if rallies.eyes.shape[0] > 0:
         _estimate(rallies, b, noise)
     else:
         _sample(rallies, b, step, noise)
     if rallies.track.shape[0] > 0:
-        track, seen = rallies.track[b], rallies.seen[b]
+        track = rallies.track[b]
         if step == 0:
             begin_track(track, seen, noise.position_noise, noise.velocity_noise)
         elif seen[6] == 0.0:
-            follow(track, seen, rallies.taken[b], noise.position_noise, noise.velocity_noise)
+            follow(track, seen, seen[_TAKEN], noise.position_noise, noise.velocity_noise)
         elif seen[6] == 1.0 and track[BOUNCED] == 0.0:
             turn_at_bounce(track, last)
 
@@ -303,9 +277,8 @@ def launch_rally(rallies: Rallies, b: int, record: Array, seed: int, noise: Nois
         for k in range(6):
             rallies.camera[b, row, k] = record[k]
         rallies.camera[b, row, 6] = 0.0
-    if rallies.estimate.shape[0] > 0:
-        pos = (record[0], record[1], record[2])
-        begin_film(rallies.shots[b], rallies.shot_counts[b], rallies.shot_due[b], seed, pos, noise)
+    if rallies.eyes.shape[0] > 0:
+        begin_film(rallies.eyes[b, :FILM], seed, (record[0], record[1], record[2]), noise)
     _look(rallies, b, 0, noise)
     for k in range(rallies.earlier.shape[1]):
         for j in range(6):
@@ -343,7 +316,7 @@ def judge(rallies: Rallies, b: int, state: int, what: int, pos: Vec, rules: Rule
 def shoot(
     rallies: Rallies, b: int, noise: NoiseProfile, since: float, p0: Vec, v0: Vec, h: float, p1: Vec, v1: Vec
 ) -> None:
-    """Let the camera film a piece of ball b's flight without touches, if there is a camera.
+    """Let the camera film a piece of ball b's flight without touches; only where there is a camera.
 
     Args:
         rallies: Row b is written.
@@ -356,21 +329,18 @@ def shoot(
         p1: Position at its end [m].
         v1: Velocity at its end, before any bounce [m/s].
     """
-    if rallies.shots.shape[0] > 0:
-        film_flight(
-            rallies.shots[b],
-            rallies.shot_counts[b],
-            rallies.shot_due[b],
-            rallies.seed[b],
-            rallies.condition[b],
-            noise,
-            rallies.clock[b] * GRID_STEP + since,
-            p0,
-            v0,
-            h,
-            p1,
-            v1,
-        )
+    film_flight(
+        rallies.eyes[b, :FILM],
+        rallies.seed[b],
+        rallies.condition[b],
+        noise,
+        rallies.clock[b] * GRID_STEP + since,
+        p0,
+        v0,
+        h,
+        p1,
+        v1,
+    )
 
 
 @kernel
@@ -395,42 +365,6 @@ def copy_path(motion: Motion, b: int, path: Array) -> None:
 
 
 @kernel
-def note_hit(hit: Array, pos: Vec, vel: Vec, spin: Vec, joints: Joints, rates: Joints, moment: float) -> None:
-    """Write ball and joints at a contact into a row of ``hit`` (HIT,)."""
-    for k in range(3):
-        hit[BALL_POS + k], hit[BALL_VEL + k], hit[BALL_SPIN + k] = pos[k], vel[k], spin[k]
-    for j in range(7):
-        hit[JOINT_POS + j], hit[JOINT_VEL + j] = joints[j], rates[j]
-    hit[MOMENT] = moment
-
-
-@kernel
-def _correct(rallies: Rallies, b: int, motion: Motion, rules: Rules, now: int, is_hit: bool) -> None:
-    """Note which drives were at their limit; after a hit, find what the last actions should have differed by."""
-    limited = rallies.limited[b, now % BACK]
-    for k in range(motion.torque.shape[1]):
-        for j in range(7):
-            limited[k, j] = abs(motion.torque[b, k, j]) >= rules.torque_limit[j] * _AT_LIMIT
-    rallies.corrected[b] = 0
-    if is_hit and rules.corrects:
-        steps = min(now + 1, BACK)
-        late = int(rallies.condition[b, 11] / motion.step + 0.5)
-        if correction(
-            rallies.hit[b],
-            rallies.condition[b],
-            rules.flight_model,
-            rallies.limited[b],
-            now,
-            steps,
-            late,
-            rules.drives,
-            motion.step,
-            rallies.corrections[b],
-        ):
-            rallies.corrected[b] = steps
-
-
-@kernel
 def _fly_one(
     rallies: Rallies, b: int, motion: Motion, rules: Rules, noise: NoiseProfile, path: Array, step: Step
 ) -> Flown:
@@ -439,6 +373,9 @@ def _fly_one(
     ball, condition = rallies.ball[b], rallies.condition[b]
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
     state = rallies.state[b]
+    filmed, reviewed = rallies.eyes.shape[0] > 0, rallies.hit.shape[0] > 0
+    if reviewed:
+        rallies.hit[b, FRESH] = 0.0
     outcome = 0
     bounced, hit, landed = False, False, False
     racket_speed = 0.0
@@ -463,7 +400,8 @@ def _fly_one(
                 motion.step,
                 fastest,
             )
-            shoot(rallies, b, noise, GRID_STEP - rest, p0, v0, flown, pos, vel)
+            if filmed:
+                shoot(rallies, b, noise, GRID_STEP - rest, p0, v0, flown, pos, vel)
             rest -= flown
             if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:
                 rallies.over[b] = True
@@ -480,9 +418,18 @@ def _fly_one(
                 surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
                 if dot(sub(vel, surface_vel), normal) >= 0.0:
                     continue  # a graze that is over as it begins: no contact without approach
-                if rallies.hit.shape[0] > 0 and not rallies.caught[b]:
-                    rates = joint_rates_at(path, moment, motion.step)
-                    note_hit(rallies.hit[b], pos, vel, spin, joints, rates, moment)
+                if reviewed and not rallies.caught[b]:
+                    now = rallies.clock[b] // rules.grid_steps
+                    note_hit(
+                        rallies.hit[b],
+                        pos,
+                        vel,
+                        spin,
+                        joints,
+                        joint_rates_at(path, moment, motion.step),
+                        moment,
+                        now,
+                    )
                 before = vel
                 vel, spin = racket_bounce(
                     vel,
@@ -641,11 +588,8 @@ def play_step(
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
         copy_path(motion, b, path)
-        now = rallies.clock[b] // rules.grid_steps
         flown = _fly_one(rallies, b, motion, rules, noise, path, step)
         settle(rallies, b, flown, motion, actions, rules, noise, path, step)
-        if rallies.corrected.shape[0] > 0:
-            _correct(rallies, b, motion, rules, now, flown.hit)
 
 
 @kernel
@@ -707,7 +651,7 @@ def observe(
                 o[at + j] = rallies.ball[b, 6 + j] if spin == SPIN_TRUE else rallies.track[b, SPIN + j]
             at += 3
         if age:
-            o[at] = rallies.clock[b] * GRID_STEP - rallies.taken[b]
+            o[at] = rallies.clock[b] * GRID_STEP - rallies.seen[b, _TAKEN]
             at += 1
         for earlier in range(rallies.earlier.shape[1]):
             for j in range(6):

@@ -23,6 +23,7 @@ from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, BALL_RADIUS, TABLE_FRICTION, TABLE_RESTITUTION0
 from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_SLOPE, flight_step
 from common.physics.table_bounce import table_bounce
+from common.physics.vec import Vec
 
 Array = npt.NDArray[np.float64]
 
@@ -146,9 +147,9 @@ def _solve(track: Array) -> None:
 
 
 @kernel
-def turn_at_bounce(track: Array, last: Array) -> None:
-    """Turn the estimate by an average table's law; ``last`` is the last sample seen before the bounce."""
-    vel = (last[3], last[4], min(last[5], -0.1))
+def turn_at_bounce(track: Array, last: Vec) -> None:
+    """Turn the estimate by an average table's law; ``last`` is the velocity last seen before the bounce [m/s]."""
+    vel = (last[0], last[1], min(last[2], -0.1))
     spin = (track[SPIN], track[SPIN + 1], track[SPIN + 2])
     _, spin = table_bounce(vel, spin, (0.0, 0.0, 1.0), TABLE_RESTITUTION0, TABLE_FRICTION)
     for k in range(3):

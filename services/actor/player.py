@@ -9,7 +9,8 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import UNVALIDATED, Episodes, PolicySnapshot, Rollout
-from common.env.rally_env import EnvConfig, EnvStep, FinishedRallies, RallyEnv, RallySource
+from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
+from common.env.review import Lessons
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import PolicyError, new_network, observation_moments, task_hash, unpack
@@ -121,7 +122,7 @@ class Player:
             self._obs = step.obs
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated
             terms += step.terms.sum(axis=0)
-            correct(corrections, t, step)
+            correct(corrections, t, step.lessons)
             cut = step.truncated[step.ended]
             if cut.any():
                 final_obs.append(step.final_obs[cut])
@@ -156,16 +157,16 @@ class Player:
         )
 
 
-def correct(corrections: Floats, t: int, step: EnvStep) -> None:
-    """Write what step ``t`` says of the block's last actions into ``corrections`` (T, B, 7).
+def correct(corrections: Floats, t: int, lessons: Lessons) -> None:
+    """Write what hits of step ``t`` say of the block's last actions into ``corrections`` (T, B, 7).
 
     What reaches back beyond the block's beginning is lost: those frames are on their way.
     """
-    for back in range(min(t + 1, step.corrections.shape[1])):
-        reached = step.corrected_steps > back
+    for back in range(min(t + 1, lessons.corrections.shape[1])):
+        reached = lessons.steps > back
         if not reached.any():
             return
-        corrections[t - back, step.corrected[reached]] = step.corrections[reached, back]
+        corrections[t - back, lessons.rows[reached]] = lessons.corrections[reached, back]
 
 
 def _episodes(finished: list[FinishedRallies]) -> Episodes:

@@ -6,6 +6,7 @@ from pydantic import ValidationError
 
 from common.env.rally_env import EnvConfig
 from common.physics.constants import GRID_STEP
+from common.rally.camera import FILM
 from common.rally.estimator import estimate_at
 from tests.unit.env.rallies import make_env, random_actions
 
@@ -42,7 +43,7 @@ def test_the_estimate_for_now_is_near_the_ball(collision):
         env.step(action)
         rallies = env.rallies
         for b in np.flatnonzero(rallies.clock * GRID_STEP > 0.1):
-            pos, vel, _ = estimate_at(rallies.estimate[b], rallies.clock[b] * GRID_STEP)
+            pos, vel, _ = estimate_at(rallies.eyes[b, FILM:], rallies.clock[b] * GRID_STEP)
             off = np.array([*pos, *vel]) - rallies.ball[b, :6]
             errors.append((np.linalg.norm(off[:3]), np.linalg.norm(off[3:])))
 
@@ -59,13 +60,13 @@ def test_what_is_seen_is_the_estimate_for_the_usual_latency_ago():
     for action in random_actions(env, 15):
         env.step(action)
     for b in range(8):
-        pos, vel, state = estimate_at(env.rallies.estimate[b], env.rallies.clock[b] * GRID_STEP - 0.025)
+        pos, vel, state = estimate_at(env.rallies.eyes[b, FILM:], env.rallies.clock[b] * GRID_STEP - 0.025)
 
         np.testing.assert_array_equal(env.rallies.seen[b], [*pos, *vel, state])
 
 
 def test_cheap_perception_has_no_camera():
-    assert make_env(4).rallies.shots.size == 0
+    assert make_env(4).rallies.eyes.size == 0
 
 
 def test_another_perception_is_refused():

@@ -10,7 +10,7 @@ from common.physics.constants import GRID_STEP
 from common.physics.fly import NO_ROBOT, fly_step
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, ROBOT_COURT
-from common.rally.camera import READ, SHOT, SHOTS, TAKEN, begin_film, film_flight
+from common.rally.camera import FILM, READ, SHOT, TAKEN, begin_film, film_flight, shot_row
 from common.rally.draws import Stream, between
 from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.launch import draw_rallies
@@ -44,11 +44,10 @@ def film_rally(
     """Fly a rally past no robot; a quarter of a second after its bounce a blow sends it back, if ``hit``."""
     condition = np.empty(CONDITIONS)
     draw_conditions(seed, record[9], record[10], noise, condition)
-    shots, counts, due = np.zeros((SHOTS, SHOT)), np.zeros(3, np.int64), np.zeros(1)
-    row = np.zeros(ESTIMATE)
+    film, row = np.zeros(FILM), np.zeros(ESTIMATE)
     pos, vel = (record[0], record[1], record[2]), (record[3], record[4], record[5])
     spin = (record[6], record[7], record[8])
-    begin_film(shots, counts, due, seed, pos, noise)
+    begin_film(film, seed, pos, noise)
     state, blow = 0, 1.0e9
     for step in range(truth.shape[0]):
         for sub in range(4):
@@ -60,7 +59,7 @@ def film_rally(
                 pos, vel, flown, what, normal = fly_step(
                     pos, vel, spin, h, condition[0], condition[1], 0, no_robot, 0.0, 1.0, 0.0
                 )
-                film_flight(shots, counts, due, seed, condition, noise, since, p0, v0, flown, pos, vel)
+                film_flight(film, seed, condition, noise, since, p0, v0, flown, pos, vel)
                 rest -= flown
                 if what == ROBOT_COURT and state == 0:
                     vel, spin = table_bounce(vel, spin, normal, condition[2], condition[3])
@@ -81,18 +80,18 @@ def film_rally(
                     spin = (0.0, -between(0.0, 100.0, seed, _RESET, 4), 0.0)
                     state = 2
         now = 4 * (step + 1) * GRID_STEP
-        while counts[READ] < counts[TAKEN]:
-            shot = shots[counts[READ] % SHOTS]
+        while film[READ] < film[TAKEN]:
+            shot = shot_row(film, int(film[READ]))
             place = (shot[1], shot[2], shot[3])
-            if counts[READ] == 0:
+            if film[READ] == 0.0:
                 begin_estimate(row, shot[0], place, noise.camera_noise)
                 shot[4] = 1.0
             elif shot[0] + latency > now + 1e-9:
                 break
             elif take_shot(row, shot[0], place, noise.camera_noise):
                 shot[4] = 1.0
-            kept[counts[READ]] = shot
-            counts[READ] += 1
+            kept[int(film[READ])] = shot
+            film[READ] += 1.0
         seen, speed, seen_state = estimate_at(row, now)
         for k in range(3):
             truth[step, k], truth[step, 3 + k] = pos[k], vel[k]
@@ -116,7 +115,7 @@ def _film_all(
         film_rally(records[k], seeds[k], noise, latency, hit, no_robot, truth[k], estimate[k], kept[k])
 
 
-def film(
+def filmed_rallies(
     rallies: int,
     *,
     noise: NoiseProfile = PROFILES["standard"],

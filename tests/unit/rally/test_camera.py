@@ -10,7 +10,7 @@ from common.physics.touch import NONE
 from common.rally.camera import MAX_RATE_HZ, SHOTS, shot_moment, shot_position
 from common.rally.launch import draw_rallies
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, PROFILES, Condition, draw_conditions
-from tests.unit.rally.filmed import CONTROL_STEPS, film
+from tests.unit.rally.filmed import CONTROL_STEPS, filmed_rallies
 
 STANDARD = PROFILES["standard"]
 SHARP = STANDARD._replace(camera_noise=0.0, outlier_share=0.0, loss=0.0, burst_share=0.0)
@@ -49,7 +49,7 @@ def test_the_ring_holds_every_shot_that_is_under_way(profile):
 
 
 def test_a_shot_shows_the_ball_at_its_own_moment_also_where_a_touch_lies_within_the_grid_step():
-    filmed = film(20, noise=SHARP, hit=False)
+    filmed = filmed_rallies(20, noise=SHARP, hit=False)
     block = draw_rallies(20, seed=0)
     condition = np.empty(CONDITIONS)
     checked = 0
@@ -95,7 +95,7 @@ def test_shots_have_the_profiles_noise_and_share_of_gross_errors():
 
 def test_three_percent_of_shots_are_lost_and_none_of_the_launch():
     noise = STANDARD._replace(burst_share=0.0)
-    filmed = film(400, noise=noise, hit=False)
+    filmed = filmed_rallies(400, noise=noise, hit=False)
     watched = np.isfinite(filmed.truth[:, :, 0]).sum(axis=1)
     long = watched >= 25
     until = 72.5 / noise.camera_rate_hz  # 0.4 s: the launch's shot and 72 that may be lost
@@ -107,7 +107,7 @@ def test_three_percent_of_shots_are_lost_and_none_of_the_launch():
 
 def test_in_a_burst_no_shot_is_kept():
     noise = STANDARD._replace(burst_share=1.0)
-    block, filmed = draw_rallies(50, seed=0), film(50, noise=noise)
+    block, filmed = draw_rallies(50, seed=0), filmed_rallies(50, noise=noise)
     condition = np.empty(CONDITIONS)
     for row in range(50):
         draw_conditions(block.seeds[row], 1.0, 1.0, noise, condition)
@@ -118,7 +118,7 @@ def test_in_a_burst_no_shot_is_kept():
 
 
 def test_without_noise_the_camera_is_perfect():
-    filmed = film(30, noise=PROFILES["off"], latency=0.0)
+    filmed = filmed_rallies(30, noise=PROFILES["off"], latency=0.0)
     stamps = shots_of(filmed, 0)[:, 0]
 
     np.testing.assert_allclose(np.diff(stamps), 1.0 / PROFILES["off"].camera_rate_hz, atol=1e-12)

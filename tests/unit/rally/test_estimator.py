@@ -21,7 +21,7 @@ from common.rally.estimator import (
     track,
 )
 from common.rally.noise import PROFILES
-from tests.unit.rally.filmed import film, off_by
+from tests.unit.rally.filmed import filmed_rallies, off_by
 
 RATE_HZ = 180.0
 SIGMA = 0.002  # m
@@ -265,7 +265,9 @@ def test_tracks_that_are_none_are_refused(times, positions):
 def test_25_ms_ahead_of_the_camera_it_is_that_close_to_the_truth(
     noise, preset, position_mm, velocity, states
 ):
-    position_error, velocity_error, state, estimated = off_by(film(600, noise=PROFILES[noise], preset=preset))
+    position_error, velocity_error, state, estimated = off_by(
+        filmed_rallies(600, noise=PROFILES[noise], preset=preset)
+    )
 
     assert 1e3 * np.median(position_error) < position_mm
     assert np.median(velocity_error) < velocity
@@ -273,7 +275,7 @@ def test_25_ms_ahead_of_the_camera_it_is_that_close_to_the_truth(
 
 
 def test_a_batch_of_tracks_equals_its_tracks_one_by_one_bit_for_bit():
-    many, fewer = film(40), film(20)
+    many, fewer = filmed_rallies(40), filmed_rallies(20)
 
     for name in ("truth", "estimate", "shots"):
         np.testing.assert_array_equal(getattr(many, name)[:20], getattr(fewer, name))
