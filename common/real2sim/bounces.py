@@ -18,7 +18,8 @@ from common.real2sim.tracks import Track
 Array = npt.NDArray[np.float64]
 
 WINDOW: Final = 8  # samples on either side: 2 mm of noise at 180 Hz leave a slope's sigma at 0.06 m/s
-FEWEST: Final = 3  # samples on a side, if the track has no more
+FEWEST: Final = 5  # samples on a side, if the track has no more
+FEWEST_AFTER: Final = 3  # samples after a bounce that the track ends with: the table's place confirms it
 RISE: Final = 1.0  # m/s; a bounce changes the vertical velocity by more
 STROKE: Final = 3.0  # m/s; a table's friction changes the horizontal velocity by less
 NEAREST: Final = 0.03  # s; a bounce with no sample that near on both sides is seen, but not measured
@@ -57,24 +58,26 @@ class Touches:
 
 
 def _line(times: Array, positions: Array, at: float) -> tuple[Array, Array]:
-    """Return position and velocity (3,) at ``at`` of the parabola under gravity through the samples."""
+    """Return position and velocity (3,) at ``at`` of the parabola under gravity through the samples.
+
+    The slope is the median of all pairs' (Theil and Sen): one sample that is wrong turns nothing.
+    """
     t = times - at
     fall = np.array([0.0, 0.0, -0.5 * GRAVITY])
     free = positions - t[:, None] ** 2 * fall
-    middle = t.mean()
-    spread = t - middle
-    slope = spread @ free / (spread @ spread)
-    return free.mean(axis=0) - middle * slope, slope
+    first, second = np.triu_indices(len(t), 1)
+    slope = np.median((free[second] - free[first]) / (t[second] - t[first])[:, None], axis=0)
+    return np.median(free - t[:, None] * slope, axis=0), slope
 
 
-def _change(track: Track, k: int) -> tuple[Array, Array]:
-    """Return position (3,) and velocity (3,) after less before, at the middle between samples k - 1 and k."""
+def _change(track: Track, k: int) -> Array:
+    """Return the velocity (3,) after less before, at the middle between samples k - 1 and k."""
     at = 0.5 * float(track.times[k - 1] + track.times[k])
     before = slice(max(0, k - WINDOW), k)
     after = slice(k, k + WINDOW)
-    p0, v0 = _line(track.times[before], track.positions[before], at)
-    p1, v1 = _line(track.times[after], track.positions[after], at)
-    return p1 - p0, v1 - v0
+    _, v0 = _line(track.times[before], track.positions[before], at)
+    _, v1 = _line(track.times[after], track.positions[after], at)
+    return v1 - v0
 
 
 def _bounce(track: Track, k: int) -> Bounce | None:
@@ -90,7 +93,7 @@ def _bounce(track: Track, k: int) -> Bounce | None:
         if rise < RISE:
             return None
         moment = start + (p0[2] - p1[2]) / rise
-        k = min(max(int(np.searchsorted(t, moment)), FEWEST), len(t) - FEWEST)
+        k = min(max(int(np.searchsorted(t, moment)), FEWEST), len(t) - FEWEST_AFTER)
     s = moment - start
     fall = np.array([0.0, 0.0, -0.5 * GRAVITY * s * s])
     position = 0.5 * (p0 + s * v0 + p1 + s * v1) + fall
@@ -109,9 +112,8 @@ def _bounce(track: Track, k: int) -> Bounce | None:
 def touches(track: Track) -> Touches:
     """Return the track's bounces, and where its free flight ends."""
     n = len(track.times)
-    moments = range(FEWEST, n - FEWEST + 1)
-    # a few samples hang together less: 2 mm over three samples are 0.25 m/s, still far below what counts
-    changes = np.array([_change(track, k)[1] for k in moments]).reshape(-1, 3)
+    moments = range(FEWEST, n - FEWEST_AFTER + 1)
+    changes = np.array([_change(track, k) for k in moments]).reshape(-1, 3)
     size = np.linalg.norm(changes, axis=1)
     turned = (changes[:, 2] > RISE) | (size > STROKE)
     bounces: list[Bounce] = []
@@ -126,8 +128,9 @@ def touches(track: Track) -> Touches:
             stop += 1
         k = moments[row + int(size[row:stop].argmax())]
         bounce = _bounce(track, k)
-        if bounce is None:
+        if bounce is not None:
+            bounces.append(bounce)
+        elif n - k >= FEWEST:
             return Touches(tuple(bounces), k)
-        bounces.append(bounce)
         row = stop
     return Touches(tuple(bounces), n)

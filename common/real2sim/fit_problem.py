@@ -1,6 +1,5 @@
 """The least squares behind ``identify.fit``: what is unknown, what is known beforehand, and how far off a guess is."""
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
@@ -28,6 +27,7 @@ UNITS: Final = np.array([0.01] * 3 + [0.1] * 3 + [20.0] * 3 + [0.1] * 2 + [0.02,
 LOW: Final = np.array([-10.0] * 3 + [-50.0] * 3 + [-2000.0] * 3 + [0.2, 0.0, 0.7, 0.02])
 # ``fly.py`` bounds the air's force by factors below 2
 HIGH: Final = np.array([10.0] * 3 + [50.0] * 3 + [2000.0] * 3 + [1.95, 1.95, 1.15, 0.6])
+SPIN_STEPS: Final = (0.01, 0.25)  # of a component's size: steps to either side of lift's saturation
 ROBUST_FROM: Final = 2.0  # [sigma] residuals beyond weigh less than their square
 
 
@@ -135,23 +135,27 @@ class Problem:
     def covariance(self, unknowns: Array) -> Array:
         """Return the values' covariance (13, 13) from the Jacobian.
 
-        The spin's derivatives are taken towards more spin: where lift has just saturated that is where nothing holds
-        it, and the other side's would promise a spin that nobody measured.
+        Taken twice, over a small and over a large step towards more spin, and the one that leaves the spin less certain
+        counts: where lift has just saturated, more spin changes nothing, and the slope at the edge would promise
+        a spin that nobody measured.
         """
-        here = self.residuals(unknowns)
-        columns = []
-        for k, unknown in enumerate(self.free):
-            step = np.zeros(len(self.free))
-            if SPIN.start <= unknown < SPIN.stop:
-                step[k] = math.copysign(max(0.05, 0.05 * abs(unknowns[k])), unknowns[k])
-                columns.append((self.residuals(unknowns + step) - here) / step[k])
-            else:
-                step[k] = 1e-4
-                columns.append((self.residuals(unknowns + step) - self.residuals(unknowns - step)) / 2e-4)
-        jacobian = np.stack(columns, axis=1)
-        covariance = np.zeros((UNKNOWNS, UNKNOWNS))
+        spin = (self.free >= SPIN.start) & (self.free < SPIN.stop)
+        found = [self._covariance(unknowns, share, spin) for share in SPIN_STEPS]
         units = UNITS[self.free]
-        covariance[np.ix_(self.free, self.free)] = np.linalg.pinv(jacobian.T @ jacobian) * np.outer(
-            units, units
-        )
+        covariance = np.zeros((UNKNOWNS, UNKNOWNS))
+        widest = max(found, key=lambda matrix: float(np.trace(matrix[np.ix_(spin, spin)])))
+        covariance[np.ix_(self.free, self.free)] = widest * np.outer(units, units)
         return covariance
+
+    def _covariance(self, unknowns: Array, share: float, spin: npt.NDArray[np.bool_]) -> Array:
+        """Return the free unknowns' covariance [UNITS] with steps of a share of each spin component."""
+        here = self.residuals(unknowns)
+        steps = np.where(spin, np.copysign(np.maximum(share, share * np.abs(unknowns)), unknowns), 1e-4)
+        columns = []
+        for k, size in enumerate(steps):
+            moved = unknowns.copy()
+            moved[k] += size
+            columns.append((self.residuals(moved) - here) / size)
+        jacobian = np.stack(columns, axis=1)
+        matrix: Array = np.linalg.pinv(jacobian.T @ jacobian)
+        return matrix
