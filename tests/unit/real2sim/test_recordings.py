@@ -153,11 +153,6 @@ def test_states_that_fly_away_are_dropped_or_turned(tmp_path):
 # ---- what is dropped
 
 
-def damaged(how):
-    rows = rows_of(TRACK)
-    return how(rows)
-
-
 def put(rows, place, value):
     rows = rows.copy()
     rows[place] = value
@@ -208,7 +203,6 @@ def test_a_bad_recording_is_dropped_and_a_good_one_beside_it_kept(tmp_path, reas
 
     assert [track.id for track in found.tracks] == ["x/1"]
     assert list(found.dropped.values()) == [1]
-    assert pytest.approx(1) == 1
     with pytest.raises(RecordingError, match=rf"x\.hdf5: no recording is usable \({reason}"):
         load(write_hdf5(tmp_path / "x.hdf5", **{"0": (rows[:, 0], in_file(GUN_FRAME, rows[:, 1:]))}))
 
