@@ -20,7 +20,7 @@ _COMMON = Path(__file__).parent
 
 def _source_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
-    folders = ("physics", "rally", "env")
+    folders = ("physics", "rally", "env", "real2sim")
     for path in sorted(path for folder in folders for path in _COMMON.glob(f"{folder}/*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]

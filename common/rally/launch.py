@@ -44,6 +44,7 @@ class Purpose(IntEnum):
     TRAINING = 0
     EVALUATION = 1
     FALLBACK = 2  # launches nobody validated, for an empty buffer
+    RECORDED = 3  # balls that somebody hit, and a camera saw
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,72 @@
+"""The benchmark of the ball's physics, on recordings that our own physics made: it must find next to no error."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from benchmarks.physics_reality import LABELS, measure
+from common.real2sim.tracks import RecordingError, Recordings, States, Track
+from tests.unit.real2sim.flights import launch_of, seen
+
+SPINS = {"topspin": (0.0, -45.0, 0.0), "backspin": (0.0, 45.0, 0.0), "no_spin": (0.0, 0.0, 0.0)}
+
+
+def recordings(duration=0.7):
+    tracks = [
+        Track(f"{label}/{k}", track.times, track.positions, label)
+        for label in LABELS
+        for k in range(2)
+        for track in [
+            seen(launch_of(spin=SPINS[label]), duration, noise=1e-3, jitter=0.35e-3, seed=k + 2 * len(label))
+        ]
+    ]
+    return [Recordings("made", tuple(tracks), States.none(), {"a reason": 2})]
+
+
+def test_our_own_balls_are_explained_to_the_cameras_noise():
+    found = measure(recordings(), "simple")
+
+    assert found["tracks"] == dict.fromkeys(LABELS, 2)
+    assert (found["bounces"], found["bounces_measured"], found["dropped"]) == (6, 6, {"a reason": 2})
+    for label in LABELS:
+        # 3-D noise: 1 mm in three axes, and .35 ms at 5 m/s
+        assert found[f"fit_rms_mm_{label}"] == pytest.approx(np.hypot(np.sqrt(3.0), 0.35 * 5.0), rel=0.2)
+    assert found["bounce_prediction_mm_median"] < 12.0
+    assert found["after_bounce_mm_median"] < 8.0
+    assert found["topspin_rad_s_topspin"] == pytest.approx(45.0, abs=8.0)
+    assert found["topspin_rad_s_backspin"] == pytest.approx(-45.0, abs=8.0)
+    for less, more in (("without_air", "without_magnus"), ("without_magnus", None)):
+        better = found[more] if more else found
+        assert found[less]["fit_rms_mm_topspin"] > 2.0 * better["fit_rms_mm_topspin"]
+
+
+def test_what_no_track_shows_is_null():
+    found = measure(recordings(duration=0.4), "simple")
+
+    assert (found["bounces"], found["bounce_prediction_mm_median"], found["after_bounce_mm_p90"]) == (
+        0,
+        None,
+        None,
+    )
+    assert json.loads(json.dumps(found)) == found
+
+
+def test_nothing_to_measure_is_an_error():
+    with pytest.raises(RecordingError, match=r"no usable track \(the files hold none\)"):
+        measure([Recordings("made", (), States.none(), {})], "simple")
+
+
+def test_a_missing_folder_is_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.physics_reality", "--json", "--data", str(tmp_path / "none")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert done.stderr.strip().splitlines() == [f"physics_reality: {tmp_path / 'none'}: no such folder"]
