@@ -310,7 +310,7 @@ class Training:
                         torch.tensor(r.log_mu.reshape(-1)),
                         log_prob(actions, mean, log_sigma),
                         mean,
-                        torch.tensor(r.corrections.reshape(-1, r.corrections.shape[-1])),
+                        torch.tensor(r.wanted.reshape(-1, r.wanted.shape[-1])),
                     )
                 )
                 advantages.append(advantage.reshape(-1))
@@ -322,9 +322,7 @@ class Training:
         scale = np.sqrt(self.value_moments.var + 1e-5)
         advantage = np.concatenate(advantages)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        obs, actions, log_mu, log_prox, mean, corrections = (
-            torch.cat(part) for part in zip(*parts, strict=True)
-        )
+        obs, actions, log_mu, log_prox, mean, wanted = (torch.cat(part) for part in zip(*parts, strict=True))
         targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
         data = Dataset(
             obs,
@@ -335,7 +333,7 @@ class Training:
             log_sigma,
             torch.from_numpy(advantage),
             torch.from_numpy(targets),
-            corrections,
+            wanted,
         )
         return data, explained
 
