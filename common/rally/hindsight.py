@@ -50,7 +50,7 @@ LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear
 LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
 LEVENBERG = 1.0  # [m^2] lambda; L L' is some 25 m^2 per (unit of action)^2
-LARGEST_CORRECTION = 0.2  # [half-range] of one joint's target
+TRUST = 0.1  # [half-range] size of a whole correction at which it counts half: a larger one leaves the linear model
 NO_NET = -1.0  # [m] height over the net of a ball that never gets there
 _FLIGHT_STEP, _LONGEST_FLIGHT = 0.010, 3.0  # [s]
 _DEEPEST = -0.7  # [m] below the table a ball that fell short isn't followed
@@ -257,7 +257,7 @@ def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> b
         sensitivity: L (GOALS, BACK, 7).
         wanted: By how much the result should change (GOALS,).
         goals: How many of them count, the first ones.
-        out: d (BACK, 7); written, each number within ``LARGEST_CORRECTION``.
+        out: d (BACK, 7), a large one scaled down; written.
     """
     steps, joints = out.shape
     gram = np.empty((goals, goals))
@@ -273,13 +273,20 @@ def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> b
         if not abs(wanted[i]) < _INSANE:
             return False
     weights = np.linalg.solve(gram, wanted[:goals].copy())
+    square = 0.0
     for k in range(steps):
         for c in range(joints):
             change = 0.0
             for i in range(goals):
                 change += sensitivity[i, k, c] * weights[i]
-            out[k, c] = min(max(change, -LARGEST_CORRECTION), LARGEST_CORRECTION)
-    return True
+            out[k, c] = change
+            square += change * change
+    # As in robust regression (Cauchy's influence): the farther off, the less a hit knows about the way there. Without it a
+    # policy that doesn't return anything yet is torn from catching before PPO can hold it.
+    for k in range(steps):
+        for c in range(joints):
+            out[k, c] /= 1.0 + square / (TRUST * TRUST)
+    return math.isfinite(square)
 
 
 @kernel
