@@ -281,8 +281,8 @@ def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> b
                 change += sensitivity[i, k, c] * weights[i]
             out[k, c] = change
             square += change * change
-    # As in robust regression (Cauchy's influence): the farther off, the less a hit knows about the way there. Without it a
-    # policy that doesn't return anything yet is torn from catching before PPO can hold it.
+    # As in robust regression (Cauchy's influence): the farther off, the less a hit knows about the way. Without it
+    # a policy that doesn't return anything yet is torn from catching before PPO can hold it.
     for k in range(steps):
         for c in range(joints):
             out[k, c] /= 1.0 + square / (TRUST * TRUST)

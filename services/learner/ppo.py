@@ -83,7 +83,7 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    wanted: Tensor  # (N, A) what the mean should have been; rows of zeros where nothing is known
+    corrections: Tensor  # (N, A) what the mean should change by; rows of zeros where nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,15 +120,16 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
 
 
-def correction_loss(mean: Tensor, wanted: Tensor) -> Tensor:
-    """Return half the mean squared distance of the mean actions from what they should have been, where that is known.
+def correction_loss(mean: Tensor, mean_prox: Tensor, corrections: Tensor) -> Tensor:
+    """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
     Args:
         mean: (N, A).
-        wanted: (N, A); rows of zeros say nothing.
+        mean_prox: (N, A) as this update found them.
+        corrections: (N, A) what is left to change; rows of zeros say nothing.
     """
-    says = (wanted != 0.0).any(-1)
-    return 0.5 * ((mean - wanted).square().sum(-1) * says).mean()
+    says = (corrections != 0.0).any(-1)
+    return 0.5 * ((mean - mean_prox - corrections).square().sum(-1) * says).mean()
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -191,7 +192,7 @@ def update(
     for parameter in network.policy_parameters():
         parameter.requires_grad_(not hold_policy)  # a frozen one has no gradient, and Adam leaves it alone
     sums = np.zeros(6)
-    is_corrected = config.correction_weight > 0 and not hold_policy and bool((data.wanted != 0.0).any())
+    is_corrected = config.correction_weight > 0 and not hold_policy and bool((data.corrections != 0.0).any())
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
         for group in optimizer.param_groups:
@@ -215,7 +216,7 @@ def update(
             loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
             loss_correction = torch.zeros(())
             if is_corrected:
-                loss_correction = correction_loss(mean, data.wanted[rows])
+                loss_correction = correction_loss(mean, data.mean_prox[rows], data.corrections[rows])
                 loss = loss + config.correction_weight * loss_correction
             if config.entropy_weight > 0:
                 loss = loss - config.entropy_weight * entropy(network.log_sigma)

@@ -310,7 +310,7 @@ class Training:
                         torch.tensor(r.log_mu.reshape(-1)),
                         log_prob(actions, mean, log_sigma),
                         mean,
-                        torch.tensor(r.wanted.reshape(-1, r.wanted.shape[-1])),
+                        self._corrections(obs, torch.tensor(r.wanted.reshape(-1, r.wanted.shape[-1]))),
                     )
                 )
                 advantages.append(advantage.reshape(-1))
@@ -322,7 +322,9 @@ class Training:
         scale = np.sqrt(self.value_moments.var + 1e-5)
         advantage = np.concatenate(advantages)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        obs, actions, log_mu, log_prox, mean, wanted = (torch.cat(part) for part in zip(*parts, strict=True))
+        obs, actions, log_mu, log_prox, mean, corrections = (
+            torch.cat(part) for part in zip(*parts, strict=True)
+        )
         targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
         data = Dataset(
             obs,
@@ -333,9 +335,20 @@ class Training:
             log_sigma,
             torch.from_numpy(advantage),
             torch.from_numpy(targets),
-            wanted,
+            corrections,
         )
         return data, explained
+
+    def _corrections(self, obs: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+        """Return what the means (N, A) should still change by, for normalised ``obs`` (N, D); zeros: nothing is known.
+
+        In full precision, as the actor computed what it wants: bfloat16 rounds means by as much as corrections are large.
+        """
+        corrections = torch.zeros_like(wanted)
+        rows = (wanted != 0.0).any(-1)
+        if self.ppo.correction_weight > 0.0 and bool(rows.any()):
+            corrections[rows] = wanted[rows] - self.network.act(obs[rows, : self.network.obs_size])
+        return corrections
 
     def _values(self, obs: Floats) -> Floats:
         if len(obs) == 0:
