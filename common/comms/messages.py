@@ -161,9 +161,8 @@ class Rollout:
     rally_flags: Annotated[U8, Wire("bits", "|u1", "T B", low=0, high=UNVALIDATED)]
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
-    # What the mean actions before a hit should have been (hindsight.correction); rows of zeros: nothing is known. Not
-    # the correction alone: the learner's policy may have taken a part of it already
-    wanted: Annotated[F32, Wire("1", "<f4", "T B 7")]
+    # What the actions before a hit should have differed by (hindsight.correction); 0 where nothing is known
+    corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 
     def fault(self) -> str:

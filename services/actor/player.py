@@ -100,7 +100,6 @@ class Player:
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
-        means = np.empty((steps, envs, ACTION_SIZE), np.float32)
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
         value_scale, value_mean = (
@@ -115,7 +114,7 @@ class Player:
                 noise = torch.randn(mean.shape, generator=self._noise)
                 action = mean + self._network.log_sigma.exp() * noise
                 log_mu[t] = log_prob(action, mean, self._network.log_sigma).numpy()
-            actions[t], means[t] = action.numpy(), mean.numpy()
+            actions[t] = action.numpy()
             values[t] = value.numpy() * value_scale + value_mean
             flags[t] = np.where(self.env.validated, 0, UNVALIDATED)
             acted = self._clock()
@@ -153,7 +152,7 @@ class Player:
             rally_flags=flags,
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
-            wanted=wanted_means(means, actions, corrections),
+            corrections=np.where(np.abs(actions) < 1.0, corrections, 0.0),
             seconds=MappingProxyType({"inference": inference, "simulation": simulation}),
         )
 
@@ -168,16 +167,6 @@ def correct(corrections: Floats, t: int, lessons: Lessons) -> None:
         if not reached.any():
             return
         corrections[t - back, lessons.rows[reached]] = lessons.corrections[reached, back]
-
-
-def wanted_means(means: Floats, actions: Floats, corrections: Floats) -> Floats:
-    """Return what the mean actions should have been (T, B, 7); rows of zeros where no hit says it.
-
-    A number beyond +-1 was clipped, so that a change of it would have changed nothing: its mean is left as it is.
-    """
-    says = (corrections != 0.0).any(axis=-1, keepdims=True)
-    reached = np.abs(actions) < 1.0
-    return np.where(says, means + corrections * reached, np.float32(0.0))
 
 
 def _episodes(finished: list[FinishedRallies]) -> Episodes:

@@ -83,7 +83,7 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: Tensor  # (N, A) what the mean should change by; rows of zeros where nothing is known
+    corrections: Tensor  # (N, A) what the mean should change by; 0 where nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +123,12 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
 def correction_loss(mean: Tensor, mean_prox: Tensor, corrections: Tensor) -> Tensor:
     """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
+    The corrected are mean_prox + correction: how the policy that this update began with should have acted.
+
     Args:
         mean: (N, A).
-        mean_prox: (N, A) as this update found them.
-        corrections: (N, A) what is left to change; rows of zeros say nothing.
+        mean_prox: (N, A).
+        corrections: (N, A); rows of zeros say nothing.
     """
     says = (corrections != 0.0).any(-1)
     return 0.5 * ((mean - mean_prox - corrections).square().sum(-1) * says).mean()

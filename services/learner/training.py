@@ -310,7 +310,7 @@ class Training:
                         torch.tensor(r.log_mu.reshape(-1)),
                         log_prob(actions, mean, log_sigma),
                         mean,
-                        self._corrections(obs, torch.tensor(r.wanted.reshape(-1, r.wanted.shape[-1]))),
+                        torch.tensor(r.corrections.reshape(-1, r.corrections.shape[-1])),
                     )
                 )
                 advantages.append(advantage.reshape(-1))
@@ -338,17 +338,6 @@ class Training:
             corrections,
         )
         return data, explained
-
-    def _corrections(self, obs: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
-        """Return what the means (N, A) should still change by, for normalised ``obs`` (N, D); zeros: nothing is known.
-
-        In full precision, as the actor computed what it wants: bfloat16 rounds means by as much as corrections are large.
-        """
-        corrections = torch.zeros_like(wanted)
-        rows = (wanted != 0.0).any(-1)
-        if self.ppo.correction_weight > 0.0 and bool(rows.any()):
-            corrections[rows] = wanted[rows] - self.network.act(obs[rows, : self.network.obs_size])
-        return corrections
 
     def _values(self, obs: Floats) -> Floats:
         if len(obs) == 0:

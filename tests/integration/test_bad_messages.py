@@ -212,7 +212,7 @@ BLOCK = (  # the fields of a rollout whose size is that of its block
     "final_index",
     "last_obs",
     "rally_flags",
-    "wanted",
+    "corrections",
 )
 
 

@@ -66,7 +66,7 @@ def make_rollout(**changes: Any) -> Rollout:
             length=np.array([50, 40], "<i4"),
         ),
         reward_terms=block(4),
-        wanted=block(T, B, 7),
+        corrections=block(T, B, 7),
         seconds={"step": 0.5, "policy": 0.1},
     )
     return dataclasses.replace(rollout, **changes)

@@ -44,6 +44,6 @@ def make_rollout(seed=0, steps=16, envs=8, **changes):
             length=np.full(episodes, 40, np.int32),
         ),
         "reward_terms": np.arange(TERMS, dtype=np.float32),
-        "wanted": np.zeros((steps, envs, ACTIONS), np.float32),
+        "corrections": np.zeros((steps, envs, ACTIONS), np.float32),
     }
     return Rollout(**(values | changes))
