@@ -11,7 +11,8 @@ iterative learning control (Arimoto 1984) with a network as its memory. Against 
 the same physics (as in SHAC, Xu et al. 2022) such a step doesn't shout where the stroke is sensitive: the mean over a
 dataset has five times the signal to noise.
 
-Wanted of a hit: that the ball comes down on its target, clears the net by a margin, and meets the racket's centre.
+Wanted of a hit: that the ball comes down on its target, clears the net by a margin, meets the racket's centre, and not
+so soon after the bounce that it might as well have been before it.
 """
 
 import math
@@ -31,14 +32,14 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 BACK = 12  # control steps that a correction looks back over: 0.24 s at 50 Hz, twice the slowest drive's lag
-GOALS = 5  # landing x, y; place on the racket (2); height over the net
-_LANDING, _PLACE, _OVER = 0, 2, 4
+GOALS = 6  # landing x, y; place on the racket (2); height over the net; time of the contact
 
 # Columns of a hit's row: the ball as it met the racket, the joints then, and when in its control step that was [s]
 BALL_POS, BALL_VEL, BALL_SPIN, JOINT_POS, JOINT_VEL, MOMENT = 0, 3, 6, 9, 16, 23
 STEP = 24  # number of that control step in the rally, from 0
 FRESH = 25  # 1: it was in the newest control step
-HIT = 26
+BOUNCE, CONTACT = 26, 27  # when the ball met the robot's court, and the racket, since launch [s]
+HIT = 28
 
 # Rows of the drives' table (5, 7)
 INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
@@ -49,6 +50,10 @@ NEAREST = 0.25  # [m] from the net on that balls are aimed to
 LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear model says the direction only
 LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
+SOONEST = 0.060  # [s] after the bounce: who hits earlier will sometimes hit before it, a volley
+PACE = (
+    3.0  # [m/s] a ball's after the bounce, about: a contact 10 ms late weighs as much as 3 cm off the target
+)
 LEVENBERG = 1.0  # [m^2] lambda; L L' is some 25 m^2 per (unit of action)^2
 TRUST = 0.1  # [half-range] size of a whole correction at which it counts half: a larger one leaves the linear model
 NO_NET = -1.0  # [m] height over the net of a ball that never gets there
@@ -61,14 +66,22 @@ _INSANE = 1e6  # results beyond this are no basis for a correction
 
 @kernel
 def note_hit(
-    hit: Array, pos: Vec, vel: Vec, spin: Vec, joints: Joints, rates: Joints, moment: float, step: int
+    hit: Array,
+    pos: Vec,
+    vel: Vec,
+    spin: Vec,
+    joints: Joints,
+    rates: Joints,
+    moment: float,
+    step: int,
+    contact: float,
 ) -> None:
     """Write ball and joints at a contact into a hit's row (HIT,)."""
     for k in range(3):
         hit[BALL_POS + k], hit[BALL_VEL + k], hit[BALL_SPIN + k] = pos[k], vel[k], spin[k]
     for j in range(7):
         hit[JOINT_POS + j], hit[JOINT_VEL + j] = joints[j], rates[j]
-    hit[MOMENT], hit[STEP], hit[FRESH] = moment, step, 1.0
+    hit[MOMENT], hit[STEP], hit[FRESH], hit[CONTACT] = moment, step, 1.0, contact
 
 
 @kernel
@@ -101,7 +114,7 @@ def _flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tu
 @kernel
 def hit_result(
     q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float]:
     """Return what a hit comes to: ``GOALS``.
 
     The racket may stand a little off the ball (or in it): the contact is shifted to the moment at which they meet.
@@ -117,7 +130,7 @@ def hit_result(
 
     Returns:
         Landing x, y [m]; offset from the racket's centre along its side and handle, times ``PLACE_WEIGHT`` [m]; height
-        over the net [m].
+        over the net [m]; by how much later the contact is, times ``PACE`` [m].
     """
     pose = racket_pose(q)
     gap, normal = racket_gap(pos, pose)
@@ -143,7 +156,8 @@ def hit_result(
         vel, spin, normal, surface, condition[4], condition[5], condition[6], condition[7], np.inf
     )
     x, y, over_net = _flies_to(pos, vel, spin, condition, model)
-    return x, y, PLACE_WEIGHT * dot(offset, pose.side), PLACE_WEIGHT * dot(offset, pose.up), over_net
+    side, up = PLACE_WEIGHT * dot(offset, pose.side), PLACE_WEIGHT * dot(offset, pose.up)
+    return x, y, side, up, over_net, PACE * later
 
 
 @kernel
@@ -168,7 +182,7 @@ def _joints(hit: Array, at: int) -> Joints:
 @kernel
 def hit_sensitivity(
     hit: Array, condition: Array, model: int, by_pos: Array, by_vel: Array
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float, float, float]:
     """Write how a hit's result depends on the joints at the contact, and return the result.
 
     Args:
@@ -250,19 +264,18 @@ def back_through_drives(
 
 
 @kernel
-def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> bool:
+def least_change(sensitivity: Array, wanted: Array, out: Array) -> bool:
     """Write d = L' (L L' + lambda)^-1 wanted; return whether it is any good.
 
     Args:
-        sensitivity: L (GOALS, BACK, 7).
+        sensitivity: L (GOALS, BACK, 7); rows of zeros: goals that are met already.
         wanted: By how much the result should change (GOALS,).
-        goals: How many of them count, the first ones.
         out: d (BACK, 7), a large one scaled down; written.
     """
     steps, joints = out.shape
-    gram = np.empty((goals, goals))
-    for i in range(goals):
-        for j in range(goals):
+    gram = np.empty((GOALS, GOALS))
+    for i in range(GOALS):
+        for j in range(GOALS):
             total = LEVENBERG if i == j else 0.0
             for k in range(steps):
                 for c in range(joints):
@@ -272,12 +285,12 @@ def least_change(sensitivity: Array, wanted: Array, goals: int, out: Array) -> b
             gram[i, j] = total
         if not abs(wanted[i]) < _INSANE:
             return False
-    weights = np.linalg.solve(gram, wanted[:goals].copy())
+    weights = np.linalg.solve(gram, wanted)
     square = 0.0
     for k in range(steps):
         for c in range(joints):
             change = 0.0
-            for i in range(goals):
+            for i in range(GOALS):
                 change += sensitivity[i, k, c] * weights[i]
             out[k, c] = change
             square += change * change
@@ -344,8 +357,12 @@ def correction(
         wanted[1] *= LARGEST_MISS / miss
     wanted[2], wanted[3] = -result[2], -result[3]
     wanted[4] = min(MARGIN - result[4], LARGEST_SHORTFALL)
-    is_low = NO_NET < result[4] < MARGIN
-    return least_change(sensitivity, wanted, GOALS if is_low else GOALS - 1, out)
+    if not NO_NET < result[4] < MARGIN:
+        wanted[4], sensitivity[4] = 0.0, 0.0
+    wanted[5] = PACE * (SOONEST - (hit[CONTACT] - hit[BOUNCE]))
+    if wanted[5] <= 0.0:
+        wanted[5], sensitivity[5] = 0.0, 0.0
+    return least_change(sensitivity, wanted, out)
 
 
 @kernel

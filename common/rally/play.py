@@ -29,7 +29,7 @@ from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
-from common.rally.hindsight import FRESH, HIT, note_hit
+from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.spin_estimate import BOUNCED, SPIN, TRACK, begin_track, follow, turn_at_bounce
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
@@ -419,17 +419,10 @@ def _fly_one(
                 if dot(sub(vel, surface_vel), normal) >= 0.0:
                     continue  # a graze that is over as it begins: no contact without approach
                 if reviewed and not rallies.caught[b]:
+                    since = rallies.clock[b] * GRID_STEP + (GRID_STEP - rest)
                     now = rallies.clock[b] // rules.grid_steps
-                    note_hit(
-                        rallies.hit[b],
-                        pos,
-                        vel,
-                        spin,
-                        joints,
-                        joint_rates_at(path, moment, motion.step),
-                        moment,
-                        now,
-                    )
+                    rates = joint_rates_at(path, moment, motion.step)
+                    note_hit(rallies.hit[b], pos, vel, spin, joints, rates, moment, now, since)
                 before = vel
                 vel, spin = racket_bounce(
                     vel,
@@ -449,6 +442,8 @@ def _fly_one(
                     step.impulse[b, 3 + k] += turn[k]
                 racket_speed = min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED)
             state, outcome = judge(rallies, b, state, what, pos, rules)
+            if reviewed and state == _TAU_1:
+                rallies.hit[b, BOUNCE] = rallies.clock[b] * GRID_STEP + (GRID_STEP - rest)
             bounced, hit, landed = (
                 bounced or state == _TAU_1,
                 hit or state == _TAU_2,

@@ -58,7 +58,7 @@ class PPOConfig(BaseModel):
         "CPU multiplies it natively",
     )
     correction_weight: float = Field(
-        1000.0,
+        500.0,
         ge=0,
         description="weight of the loss that draws the mean towards what the last actions before a hit should have "
         "been; 0: PPO alone",
