@@ -93,7 +93,9 @@ def make_data(network, count=512, seed=0):
     advantages = (actions[:, 0] - mean[:, 0]) * torch.sign(obs[:, 0])
     advantages = (advantages - advantages.mean()) / advantages.std()
     nothing = torch.zeros_like(mean)
-    return Dataset(obs, actions, log_mu, log_mu.clone(), mean, log_sigma, advantages, obs[:, 1].clone(), nothing)
+    return Dataset(
+        obs, actions, log_mu, log_mu.clone(), mean, log_sigma, advantages, obs[:, 1].clone(), nothing
+    )
 
 
 def test_an_update_moves_the_policy_where_the_advantage_points_and_fits_the_value():

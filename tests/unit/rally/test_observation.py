@@ -35,7 +35,9 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
     start = np.array(joints) - 0.02 * np.array(rates)
     play.play_step(rallies, make_motion(start, joints), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
     out = np.empty((1, 37), np.float32)
-    play.observe(rallies, np.array([0]), np.array([joints]), np.array([rates]), False, False, out)
+    play.observe(
+        rallies, np.array([0]), np.array([joints]), np.array([rates]), play.SPIN_HIDDEN, False, False, out
+    )
     return out[0]
 
 
@@ -123,14 +125,15 @@ def test_the_documented_layout_is_the_real_one():
 
 
 @pytest.mark.parametrize("history", [0, 1, 5])
-@pytest.mark.parametrize("spin", [False, True])
+@pytest.mark.parametrize("spin", ["hidden", "estimated", "true"])
+@pytest.mark.parametrize("age", [False, True])
 @pytest.mark.parametrize("critic", ["policy", "privileged"])
-def test_options_only_add_numbers_behind_the_papers(history, spin, critic):
-    config = ObservationConfig(history=history, spin=spin, critic=critic)
+def test_options_only_add_numbers_behind_the_papers(history, spin, age, critic):
+    config = ObservationConfig(history=history, spin=spin, age=age, critic=critic)
 
     assert policy_layout(config)[: len(OBSERVATION)] == OBSERVATION
     assert critic_layout(config)[: len(policy_layout(config))] == policy_layout(config)
-    assert size(policy_layout(config)) == 37 + 3 * spin + 6 * history
+    assert size(policy_layout(config)) == 37 + 3 * (spin != "hidden") + age + 6 * history
     assert size(critic_layout(config)) - size(policy_layout(config)) == size(PRIVILEGED) * (
         critic == "privileged"
     )
@@ -147,7 +150,7 @@ def played(config, steps=12, noise="standard"):
 
 
 def test_the_memory_holds_what_was_seen_before_newest_first():
-    observations, _ = played(ObservationConfig(history=3, critic="policy"))
+    observations, _ = played(ObservationConfig(history=3, spin="hidden", age=False, critic="policy"))
     seen = observations[:, 24:30]
 
     for age in (1, 2, 3):
@@ -158,7 +161,7 @@ def test_the_memory_holds_what_was_seen_before_newest_first():
 
 def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():
     paper, _ = played(PAPER_OBSERVATION)
-    all_, truth = played(ObservationConfig(history=0, spin=True))
+    all_, truth = played(ObservationConfig(history=0, spin="true", age=False))
 
     np.testing.assert_array_equal(all_[:, :37], paper)
     np.testing.assert_allclose(all_[:, 37:40], truth[:, 6:9], rtol=1e-6)  # option spin
