@@ -8,6 +8,7 @@ import pytest
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import EnvConfig, RallyEnv
 from common.physics.arm import racket_motion, racket_pose
+from common.physics.constants import GRID_STEP
 from common.rally import play
 from common.rally.noise import PROFILES
 from common.rally.observation import (
@@ -22,6 +23,7 @@ from common.rally.observation import (
     policy_layout,
     size,
 )
+from common.rally.spin_estimate import SPIN
 from common.rally.trajectory import State
 from tests.unit.rally.scripted import HOME, begin, make_motion, make_record, make_rules
 
@@ -157,6 +159,26 @@ def test_the_memory_holds_what_was_seen_before_newest_first():
         earlier = observations[:, 37 + 6 * (age - 1) : 37 + 6 * age]
         np.testing.assert_array_equal(earlier[age:], seen[:-age])
         np.testing.assert_array_equal(earlier[0], seen[0])  # before the launch there was nothing else to see
+
+
+def test_the_spin_as_estimated_and_the_samples_age_stand_behind_the_papers_numbers():
+    env = RallyEnv(3, EnvConfig(), LocalRallies(seed=3, noise="standard"))
+    env.reset()
+    at = offsets(policy_layout(EnvConfig().observation))
+    ages = []
+    for _ in range(12):
+        obs = env.step(np.tile(env.home_action, (3, 1))).obs
+        rallies = env.rallies
+        age = rallies.clock * GRID_STEP - rallies.seen[:, 7]
+        ages.append(obs[:, at["sample_age"]][:, 0])
+
+        np.testing.assert_array_equal(
+            obs[:, at["spin_estimate"]], rallies.track[:, SPIN : SPIN + 3].astype(np.float32)
+        )
+        np.testing.assert_array_equal(ages[-1], age.astype(np.float32))
+
+    assert np.abs(obs[:, at["spin_estimate"]]).max() > 1.0
+    assert np.min(ages) >= 0.0099  # the camera's latency, 10 to 40 ms; more where a sample was lost
 
 
 def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():
