@@ -27,12 +27,15 @@ from common.physics.flight import flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
 from common.physics.vec import Vec, axpy, dot, sub
+from common.rally.heading import LONGEST_RETURN, NOT_THAT_FAR
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 BACK = 12  # control steps that a correction looks back over: 0.24 s at 50 Hz, twice the slowest drive's lag
-GOALS = 6  # landing x, y; place on the racket (2); height over the net; time of the contact
+# Goals: landing x, y; place on the racket (2); height over the net, where it lacks; time of the contact, where too soon
+_LANDING, _PLACE, _OVER, _LATER = 0, 2, 4, 5
+GOALS = 6
 
 # Columns of a hit's row: the ball as it met the racket, the joints then, and when in its control step that was [s]
 BALL_POS, BALL_VEL, BALL_SPIN, JOINT_POS, JOINT_VEL, MOMENT = 0, 3, 6, 9, 16, 23
@@ -51,13 +54,10 @@ LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear
 LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
 SOONEST = 0.060  # [s] after the bounce: who hits earlier will sometimes hit before it, a volley
-PACE = (
-    3.0  # [m/s] a ball's after the bounce, about: a contact 10 ms late weighs as much as 3 cm off the target
-)
+PACE = 3.0  # [m/s] a ball's, about: a contact that is 10 ms too soon weighs as much as 3 cm off the target
 LEVENBERG = 1.0  # [m^2] lambda; L L' is some 25 m^2 per (unit of action)^2
 TRUST = 0.1  # [half-range] size of a whole correction at which it counts half: a larger one leaves the linear model
-NO_NET = -1.0  # [m] height over the net of a ball that never gets there
-_FLIGHT_STEP, _LONGEST_FLIGHT = 0.010, 3.0  # [s]
+_FLIGHT_STEP = 0.010  # [s]
 _DEEPEST = -0.7  # [m] below the table a ball that fell short isn't followed
 _SLOWEST_CLOSING = -0.5  # [m/s] slower contacts would be shifted too far in time
 _POS_STEP, _VEL_STEP = 1e-4, 1e-3  # of the differences [m, rad], [m/s, rad/s]
@@ -88,11 +88,12 @@ def note_hit(
 def _flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, float]:
     """Return where a ball comes down to the table's height, x and y [m], and by how much it clears the net [m].
 
-    A ball that comes down before the net is followed on below the table: by how much it lacks height is known then.
+    Unlike in ``heading.heading`` a ball that comes down before the net is followed on below the table: by how much it
+    lacks height is known then.
     """
-    over_net = NO_NET
+    over_net = NOT_THAT_FAR
     x, y, is_down = pos[0], pos[1], False
-    for _ in range(math.ceil(_LONGEST_FLIGHT / _FLIGHT_STEP)):
+    for _ in range(math.ceil(LONGEST_RETURN / _FLIGHT_STEP)):
         before = pos
         pos, vel = flight_step(pos, vel, spin, _FLIGHT_STEP, condition[0], condition[1], model)
         if before[0] < 0.0 <= pos[0]:
@@ -109,6 +110,16 @@ def _flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tu
         if pos[2] < _DEEPEST:
             break
     return x, y, over_net
+
+
+@kernel
+def _meeting(q: Joints, qd: Joints, pos: Vec) -> tuple[float, Vec, Vec]:
+    """Return gap [m] and normal between racket and ball, and the racket's velocity where they meet [m/s]."""
+    pose = racket_pose(q)
+    gap, normal = racket_gap(pos, pose)
+    racket_vel, racket_spin = racket_motion(q, qd)
+    surface_vel = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
+    return gap, normal, surface_vel
 
 
 @kernel
@@ -132,11 +143,8 @@ def hit_result(
         Landing x, y [m]; offset from the racket's centre along its side and handle, times ``PLACE_WEIGHT`` [m]; height
         over the net [m]; by how much later the contact is, times ``PACE`` [m].
     """
-    pose = racket_pose(q)
-    gap, normal = racket_gap(pos, pose)
-    racket_vel, racket_spin = racket_motion(q, qd)
-    surface = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
-    later = -gap / min(dot(sub(vel, surface), normal), _SLOWEST_CLOSING)
+    gap, normal, surface_vel = _meeting(q, qd, pos)
+    later = -gap / min(dot(sub(vel, surface_vel), normal), _SLOWEST_CLOSING)
     pos = axpy(later, vel, pos)
     q = (
         q[0] + later * qd[0],
@@ -147,13 +155,11 @@ def hit_result(
         q[5] + later * qd[5],
         q[6] + later * qd[6],
     )
+    _, normal, surface_vel = _meeting(q, qd, pos)
     pose = racket_pose(q)
-    _, normal = racket_gap(pos, pose)
-    racket_vel, racket_spin = racket_motion(q, qd)
-    surface = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
     offset = sub(pos, pose.centre)
     vel, spin = racket_bounce(
-        vel, spin, normal, surface, condition[4], condition[5], condition[6], condition[7], np.inf
+        vel, spin, normal, surface_vel, condition[4], condition[5], condition[6], condition[7], np.inf
     )
     x, y, over_net = _flies_to(pos, vel, spin, condition, model)
     side, up = PLACE_WEIGHT * dot(offset, pose.side), PLACE_WEIGHT * dot(offset, pose.up)
@@ -192,9 +198,9 @@ def hit_sensitivity(
         by_pos: (GOALS, 7) d result / d joint position; written.
         by_vel: (GOALS, 7) d result / d joint velocity; written.
     """
-    pos = (hit[0], hit[1], hit[2])
-    vel = (hit[3], hit[4], hit[5])
-    spin = (hit[6], hit[7], hit[8])
+    pos = (hit[BALL_POS], hit[BALL_POS + 1], hit[BALL_POS + 2])
+    vel = (hit[BALL_VEL], hit[BALL_VEL + 1], hit[BALL_VEL + 2])
+    spin = (hit[BALL_SPIN], hit[BALL_SPIN + 1], hit[BALL_SPIN + 2])
     q, qd = _joints(hit, JOINT_POS), _joints(hit, JOINT_VEL)
     result = hit_result(q, qd, pos, vel, spin, condition, model)
     for joint in range(7):
@@ -231,7 +237,7 @@ def back_through_drives(
         limited: (BACK, n, 7) whether a drive was at its limit, by control step (a ring) and substep.
         newest: The ring's row of the contact's control step.
         steps: How many control steps back the rally (or the ring) reaches, that one included.
-        late: Action latency [substeps]: that long into a control step the target before holds.
+        late: Action latency [substeps], from the beginning of an action's control step on.
         drives: (5, 7) inertia, k_p, k_v, joint damping, half-range of the targets.
         h: MuJoCo's time step [s].
         out: (BACK, 7) by control step, the contact's first; written.
@@ -256,8 +262,8 @@ def back_through_drives(
                     on_v *= inertia / slowed
                     continue
                 pull = h * stiffness / driven * on_v
-                age = k + 1 if s < late else k
-                if age < out.shape[0]:
+                age = k + (late - s + substeps - 1) // substeps if s < late else k
+                if age < steps:  # what was told before belongs to another rally
                     out[age, j] += pull * drives[HALF_RANGE, j]
                 on_v *= inertia / driven
                 on_q -= pull
@@ -349,19 +355,21 @@ def correction(
             sensitivity[goal],
         )
     wanted = np.empty(GOALS)
-    wanted[0] = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE) - result[0]
-    wanted[1] = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE) - result[1]
-    miss = math.sqrt(wanted[0] * wanted[0] + wanted[1] * wanted[1])
+    target_x = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE)
+    target_y = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE)
+    miss_x, miss_y = target_x - result[_LANDING], target_y - result[_LANDING + 1]
+    miss = math.sqrt(miss_x * miss_x + miss_y * miss_y)
     if miss > LARGEST_MISS:
-        wanted[0] *= LARGEST_MISS / miss
-        wanted[1] *= LARGEST_MISS / miss
-    wanted[2], wanted[3] = -result[2], -result[3]
-    wanted[4] = min(MARGIN - result[4], LARGEST_SHORTFALL)
-    if not NO_NET < result[4] < MARGIN:
-        wanted[4], sensitivity[4] = 0.0, 0.0
-    wanted[5] = PACE * (SOONEST - (hit[CONTACT] - hit[BOUNCE]))
-    if wanted[5] <= 0.0:
-        wanted[5], sensitivity[5] = 0.0, 0.0
+        miss_x *= LARGEST_MISS / miss
+        miss_y *= LARGEST_MISS / miss
+    wanted[_LANDING], wanted[_LANDING + 1] = miss_x, miss_y
+    wanted[_PLACE], wanted[_PLACE + 1] = -result[_PLACE], -result[_PLACE + 1]
+    wanted[_OVER] = min(MARGIN - result[_OVER], LARGEST_SHORTFALL)
+    if not NOT_THAT_FAR < result[_OVER] < MARGIN:
+        wanted[_OVER], sensitivity[_OVER] = 0.0, 0.0
+    wanted[_LATER] = PACE * (SOONEST - (hit[CONTACT] - hit[BOUNCE]))
+    if wanted[_LATER] <= 0.0:
+        wanted[_LATER], sensitivity[_LATER] = 0.0, 0.0
     return least_change(sensitivity, wanted, out)
 
 

@@ -150,8 +150,8 @@ def markdown() -> str:
     ]
     tables = (
         ("Observation", OBSERVATION),
-        ("Option spin, after it: estimated", SPIN_ESTIMATE),
-        ("or true", SPIN),
+        ("Option spin estimated, after it", SPIN_ESTIMATE),
+        ("Option spin true, in its place", SPIN),
         ("Option age, after that", AGE),
         ("Option history, after that, each", EARLIER),
         ("What the critic alone sees, last", PRIVILEGED),
@@ -160,7 +160,7 @@ def markdown() -> str:
     for title, layout in tables:
         lines += [
             "",
-            f"## {title}: {size(layout)} numbers",
+            f"## {title}: {size(layout)} number{'s' if size(layout) > 1 else ''}",
             "",
             "| index | name | unit | range | is |",
             "|---|---|---|---|---|",

@@ -418,7 +418,7 @@ def _fly_one(
                 surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
                 if dot(sub(vel, surface_vel), normal) >= 0.0:
                     continue  # a graze that is over as it begins: no contact without approach
-                if reviewed and state in (_TAU_1, _TAU_12):
+                if reviewed and rules.transitions[state, RACKET] == _TAU_2:
                     since = rallies.clock[b] * GRID_STEP + (GRID_STEP - rest)
                     now = rallies.clock[b] // rules.grid_steps
                     rates = joint_rates_at(path, moment, motion.step)

@@ -73,8 +73,8 @@ def play_match(
     room = len(rallies.seeds) // (EPISODES_EACH * config.rounds) if config.rounds > 1 else len(rallies.seeds)
     envs = min(envs, max(1, room))
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
-    # What shortens or lengthens training episodes has no place in a match: every flight is played to its end.
-    task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0})
+    # What only training asks for has no place in a match: every flight is played to its end, and nobody is taught.
+    task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0, "hindsight": False})
     env = RallyEnv(envs, task, FixedRallies(rallies, filler), stage=3)
     obs = env.reset()
     ended: list[FinishedRallies] = []

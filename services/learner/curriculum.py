@@ -19,7 +19,6 @@ class CurriculumConfig(BaseModel):
     catch_gate: float = Field(
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
     )
-
     aiming_log_sigma: float = Field(
         -2.5,
         ge=-5,

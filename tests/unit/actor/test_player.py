@@ -6,12 +6,14 @@ import torch
 
 from common.comms.messages import UNVALIDATED, PolicySnapshot
 from common.env.rally_env import EnvConfig, Launches
+from common.env.review import NO_LESSONS, Lessons
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import normalize
 from common.policy.weights import PolicyError, new_network, observation_moments, pack
+from common.rally.hindsight import BACK
 from common.rally.launch import draw_rallies
 from common.rally.observation import critic_layout, size
-from services.actor.player import Player
+from services.actor.player import Player, correct
 
 ENVS, HORIZON = 6, 40
 NETWORK = NetworkConfig(units=(16, 8))
@@ -156,6 +158,91 @@ def test_a_policy_of_another_task_or_with_unusable_weights_is_refused_and_the_ol
     assert player.snapshot.version == 7
     for name, value in player._network.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def make_lessons(*hits, seed=0):
+    """Return lessons of random numbers for (row, steps)."""
+    rng = np.random.default_rng(seed)
+    rows, steps = np.array(hits).T
+    return Lessons(rows, rng.normal(size=(len(rows), BACK, 7)).astype(np.float32), steps)
+
+
+def test_a_correction_stands_at_its_control_step_and_robot():
+    corrections = np.zeros((20, 4, 7), np.float32)
+    lessons = make_lessons((2, BACK), (0, 3))
+    correct(corrections, 15, lessons)
+    expected = np.zeros_like(corrections)
+    for k, (row, steps) in enumerate([(2, BACK), (0, 3)]):
+        for back in range(steps):
+            expected[15 - back, row] = lessons.corrections[k, back]
+
+    np.testing.assert_array_equal(corrections, expected)
+
+
+def test_what_reaches_beyond_the_blocks_beginning_is_lost():
+    corrections = np.zeros((20, 4, 7), np.float32)
+    lessons = make_lessons((1, BACK))
+    correct(corrections, 2, lessons)
+
+    np.testing.assert_array_equal(corrections[[2, 1, 0], 1], lessons.corrections[0, :3])
+    np.testing.assert_array_equal(corrections[3:], 0.0)
+
+
+def test_a_step_without_hits_leaves_the_corrections():
+    corrections = np.ones((20, 4, 7), np.float32)
+    correct(corrections, 15, NO_LESSONS)
+
+    np.testing.assert_array_equal(corrections, 1.0)
+
+
+def struck_block(monkeypatch, stage=3, **changes):
+    """Return a block of 64 robots that stand about home, some of which the ball hits, and its steps' lessons."""
+    player = Player(CONFIG.model_copy(update=changes), NETWORK, Dealer(), 64, HORIZON, 1)
+    torch.manual_seed(0)
+    network = new_network(NETWORK, OBSERVATION, player.env.home_action)
+    with torch.no_grad():
+        network.mean.bias[0] = (
+            1.2  # the first joint is told more than it can do, and nothing can be learned there
+        )
+    player.adopt(make_snapshot(player, stage=stage, weights=pack(network)))
+    lessons, step = [], player.env.step
+
+    def noted(actions):
+        result = step(actions)
+        lessons.append(result.lessons)
+        return result
+
+    monkeypatch.setattr(player.env, "step", noted)
+    return player.play("a", 9, 3), lessons
+
+
+def test_a_blocks_corrections_are_those_of_its_hits_but_where_an_action_was_clipped(monkeypatch):
+    block, lessons = struck_block(monkeypatch)
+    expected = np.zeros_like(block.corrections)
+    for t, said in enumerate(lessons):
+        for row, correction, steps in zip(said.rows, said.corrections, said.steps, strict=True):
+            for back in range(min(steps, t + 1)):
+                for joint in range(7):
+                    if abs(block.actions[t - back, row, joint]) < 1.0:
+                        expected[t - back, row, joint] = correction[back, joint]
+                    else:
+                        expected[t - back, row, joint] = 0.0
+
+    assert sum(said.rows.size for said in lessons) > 3
+    assert block.corrections.dtype == np.float32
+    assert (np.abs(block.actions) >= 1.0).any()
+    np.testing.assert_array_equal(block.corrections, expected)
+
+
+@pytest.mark.parametrize(
+    ("stage", "changes"), [(1, {}), (2, {}), (3, {"hindsight": False}), (3, {"collision": "original"})]
+)
+def test_who_is_told_nothing_learns_nothing(monkeypatch, stage, changes):
+    block, _ = struck_block(monkeypatch, stage, **changes)
+
+    assert block.episodes.caught.any()
+    assert block.corrections.shape == block.actions.shape
+    np.testing.assert_array_equal(block.corrections, 0.0)
 
 
 def test_nothing_is_played_before_there_is_a_policy():

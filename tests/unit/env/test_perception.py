@@ -60,9 +60,11 @@ def test_what_is_seen_is_the_estimate_for_the_usual_latency_ago():
     for action in random_actions(env, 15):
         env.step(action)
     for b in range(8):
-        pos, vel, state = estimate_at(env.rallies.eyes[b, FILM:], env.rallies.clock[b] * GRID_STEP - 0.025)
+        pos, vel, state = estimate_at(
+            env.rallies.eyes[b, FILM:], taken := env.rallies.clock[b] * GRID_STEP - 0.025
+        )
 
-        np.testing.assert_array_equal(env.rallies.seen[b], [*pos, *vel, state])
+        np.testing.assert_array_equal(env.rallies.seen[b], [*pos, *vel, state, taken])
 
 
 def test_cheap_perception_has_no_camera():

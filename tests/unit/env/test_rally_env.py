@@ -374,8 +374,9 @@ def test_robots_that_go_home_start_within_the_spread():
     assert np.abs(offset).max() > 0.09
 
 
-def test_every_number_stays_within_its_stated_range_in_random_play():
-    seen = ObservationConfig(history=2, spin=True)
+@pytest.mark.parametrize("spin", ["estimated", "true"])
+def test_every_number_stays_within_its_stated_range_in_random_play(spin):
+    seen = ObservationConfig(history=2, spin=spin)
     layout = critic_layout(seen)
     at = offsets(layout)
     env = make_env(64, EnvConfig(noise="hard", observation=seen), rallies=2000)

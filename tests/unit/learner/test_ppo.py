@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from services.learner.ppo import (
     PPOConfig,
     adapted_learning_rate,
     bound_loss,
+    correction_loss,
     explained_variance,
     policy_loss,
     update,
@@ -164,3 +167,94 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_told():
     assert not stats.finite
     for name, value in network.state_dict().items():
         assert torch.equal(value, before[name])
+
+
+def make_corrections(count=512, share=0.2, seed=0):
+    """Return corrections (count, 7): some rows, and in each of them some joints."""
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(size=(count, 1)) < share
+    return torch.from_numpy((0.1 * rng.normal(size=(count, 7)) * rows).astype(np.float32))
+
+
+def test_the_correction_loss_is_half_the_mean_squared_distance_from_what_should_have_been_done():
+    rng = np.random.default_rng(1)
+    mean, mean_prox = (torch.from_numpy(rng.normal(size=(50, 7))) for _ in range(2))
+    corrections = make_corrections(50).double()
+    total = 0.0
+    for row in range(50):
+        if any(corrections[row, joint] != 0 for joint in range(7)):
+            for joint in range(7):
+                wanted = mean_prox[row, joint] + corrections[row, joint]
+                total += 0.5 * float(mean[row, joint] - wanted) ** 2
+
+    assert 0 < int((corrections != 0).any(-1).sum()) < 50
+    assert float(correction_loss(mean, mean_prox, corrections)) == pytest.approx(total / 50)
+
+
+def test_what_is_not_corrected_is_not_drawn_anywhere():
+    mean = torch.randn(50, 7, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    corrections = make_corrections(50)
+    correction_loss(mean, torch.zeros(50, 7), corrections).backward()
+    silent = (corrections == 0).all(-1)
+
+    assert mean.grad is not None
+    assert (mean.grad[silent] == 0).all()
+    assert (mean.grad[~silent] != 0).all()
+
+
+def updated(corrections, weight, advantages=1.0, passes=2):
+    """Return the network after updates with these corrections, its dataset and the last statistics."""
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    data = make_data(network)
+    data = replace(data, corrections=corrections, advantages=advantages * data.advantages)
+    config = PPOConfig(minibatch=128, mini_epochs=passes, correction_weight=weight)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    stats = update(network, optimizer, data, config, 1e-3, 1e-3, torch.Generator().manual_seed(0))
+    return network, data, stats
+
+
+def test_without_weight_or_corrections_it_is_plain_ppo_bit_for_bit():
+    plain, _, _ = updated(torch.zeros(512, 7), weight=0.0)
+    unweighted, _, _ = updated(make_corrections(), weight=0.0)
+    uncorrected, _, stats = updated(torch.zeros(512, 7), weight=1000.0)
+
+    assert stats.correction_loss == 0.0
+    for a, b, c in zip(plain.parameters(), unweighted.parameters(), uncorrected.parameters(), strict=True):
+        assert torch.equal(a, b)
+        assert torch.equal(a, c)
+
+
+def test_an_update_moves_the_mean_towards_the_corrections():
+    corrections = make_corrections() + 0.0
+    corrections[(corrections != 0).any(-1)] = torch.tensor([0.1, -0.1, 0.05, 0.0, 0.0, 0.1, -0.05])
+    network, data, stats = updated(corrections, weight=1000.0, passes=8)
+    says = (corrections != 0).any(-1)
+    with torch.no_grad():
+        moved = (network(data.obs)[0] - data.mean_prox)[says]
+    before, after = (float((m - corrections[says]).square().sum(-1).mean()) for m in (0.0 * moved, moved))
+
+    assert after < 0.5 * before
+    assert float((moved * corrections[says]).sum(-1).mean()) > 0
+    assert stats.correction_loss > 0
+
+
+def test_a_held_policy_is_not_corrected():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    data = replace(make_data(network), corrections=make_corrections())
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    stats = update(
+        network,
+        optimizer,
+        data,
+        PPOConfig(minibatch=128),
+        1e-3,
+        1e-3,
+        torch.Generator().manual_seed(0),
+        hold_policy=True,
+    )
+
+    with torch.no_grad():
+        assert torch.equal(network(data.obs)[0], data.mean_prox)
+    assert stats.correction_loss == 0.0

@@ -210,3 +210,37 @@ def test_a_new_normaliser_does_not_change_what_a_later_stage_plays():
 
     assert np.abs(training.obs_moments.mean - moments.mean).min() > 0.5
     torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
+
+
+def test_a_correction_goes_with_the_observation_it_was_made_for():
+    training = make_training()
+    rollouts = []
+    for rollout in dataset(0):
+        corrections = np.repeat(rollout.obs[..., :1], 7, axis=-1)
+        rollouts.append(replace(rollout, corrections=corrections))
+    data, _ = training._dataset(rollouts)
+
+    assert data.corrections.shape == data.actions.shape
+    raw = np.concatenate([r.obs.reshape(-1, 37) for r in rollouts])
+    np.testing.assert_array_equal(data.corrections.numpy(), np.repeat(raw[:, :1], 7, axis=1))
+    np.testing.assert_allclose(data.obs[:, 0].numpy(), np.clip(raw[:, 0], -5, 5), rtol=1e-4)
+
+
+@pytest.mark.parametrize("aiming_log_sigma", [-2.5, -1.0])
+def test_as_aiming_begins_the_action_noise_is_calmed_to_what_it_may_be_and_not_before(aiming_log_sigma):
+    curriculum = CURRICULUM.model_copy(update={"aiming_log_sigma": aiming_log_sigma})
+    training = Training(PPO, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
+    noises = {}
+    for epoch in range(6):
+        stage = training.run_epoch(dataset(epoch)).progress.stage
+        noises[stage] = [n.log_sigma.detach().clone() for n in (training.network, training.average)]
+        if stage == 3:
+            break
+
+    for before, after in zip(noises[2], noises[3], strict=True):
+        assert (before > -2.0).all()
+        if aiming_log_sigma == -2.5:
+            assert (after == -2.5).all()
+        else:  # what is calmer already stays as it is
+            assert (after < -1.0).all()
+            assert (after > -2.0).all()

@@ -8,7 +8,7 @@ from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_d
 from common.policy.d2rl import D2RL
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
-from common.rally.observation import PRIVILEGED, ObservationConfig, size
+from common.rally.observation import PAPER_OBSERVATION, PRIVILEGED, size
 
 PAPER_UNITS = (256, 128, 128, 64, 64, 32)
 
@@ -89,7 +89,9 @@ def test_log_probability_entropy_and_divergence_are_the_gaussians():
 
 def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it():
     torch.manual_seed(0)
-    network = new_network(NetworkConfig(units=(16, 8)), ObservationConfig(history=0, critic="privileged"))
+    network = new_network(
+        NetworkConfig(units=(16, 8)), PAPER_OBSERVATION.model_copy(update={"critic": "privileged"})
+    )
     obs = torch.randn(4, 37 + TRUTH)
     other = obs.clone()
     other[:, 37:] = torch.randn(4, TRUTH)
@@ -108,7 +110,7 @@ def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it(
 def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, critic):
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    config = ObservationConfig(history=0, critic=critic)
+    config = PAPER_OBSERVATION.model_copy(update={"critic": critic})
     network = new_network(NetworkConfig(units=(32, 16, 8), trunks=trunks), config)
     width = 37 + TRUTH * (critic == "privileged")
     old = Moments(rng.normal(size=width), rng.uniform(0.5, 2.0, size=width), 1)

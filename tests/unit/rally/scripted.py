@@ -33,7 +33,7 @@ class Played:
     outcome: Outcome
     states: list[State]  # at the end of each step
     balls: Array  # (n, 9)
-    seen: Array  # (n, 7) the sample the robot goes by
+    seen: Array  # (n, 8) the sample the robot goes by, and when it was taken
     terms: Array  # (n, 8) reward.TERMS
     rewards: Array  # (n,)
     impulses: Array  # (n, 6)
