@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.physics.arm import point_velocity, racket_motion, racket_pose
-from common.physics.constants import BALL_RADIUS, NET_HEIGHT
+from common.physics.constants import BALL_RADIUS, NET_HEIGHT, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import SIMPLE, flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
@@ -13,14 +13,19 @@ from common.rally.hindsight import (
     BALL_POS,
     BALL_SPIN,
     BALL_VEL,
+    EDGE,
     FRESH,
     GOALS,
     HIT,
     JOINT_POS,
     JOINT_VEL,
     LARGEST_CORRECTION,
+    LARGEST_MISS,
+    LARGEST_SHORTFALL,
     LEVENBERG,
+    MARGIN,
     MOMENT,
+    NEAREST,
     PLACE_WEIGHT,
     STEP,
     back_through_drives,
@@ -29,7 +34,7 @@ from common.rally.hindsight import (
     hit_sensitivity,
     least_change,
 )
-from common.rally.noise import CONDITIONS, PROFILES, draw_conditions
+from common.rally.noise import CONDITIONS, PROFILES, Condition, draw_conditions
 from tests.unit.rally.scripted import HOME
 
 SUBSTEPS, H = 5, 0.004
@@ -256,12 +261,13 @@ def test_no_number_of_a_change_is_beyond_the_largest():
     assert np.abs(out).max() == LARGEST_CORRECTION
 
 
-def corrected(hits, condition=None, limited=None) -> tuple[np.ndarray, np.ndarray]:
+def corrected(hits, conditions=None) -> tuple[np.ndarray, np.ndarray]:
     """Return corrections (B, BACK, 7), 7 where nothing was written, and how far back they reach (B,)."""
     count = len(hits)
-    conditions = np.array([make_condition(b) for b in range(count)]) if condition is None else condition
+    if conditions is None:
+        conditions = np.array([make_condition(b) for b in range(count)])
     out, steps = np.full((count, BACK, 7), 7.0), np.full(count, -1)
-    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.bool_) if limited is None else limited
+    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.bool_)
     corrections(hits, conditions, SIMPLE, limited, 3, DRIVES, H, out, steps)
     return out, steps
 
@@ -305,13 +311,32 @@ def test_what_isnt_finite_never_leaves(column, wrong):
     np.testing.assert_array_equal(found[[0, 2]], whole[[0, 2]])
 
 
-def test_a_ball_that_clears_the_net_by_more_than_the_margin_isnt_asked_to_rise():
-    """The height over the net isn't a goal there: its sensitivity doesn't matter."""
-    rng = np.random.default_rng(0)
-    sensitivity, wanted = rng.normal(size=(GOALS, BACK, 7)), 0.1 * rng.normal(size=GOALS)
-    one, other = np.empty((BACK, 7)), np.empty((BACK, 7))
-    least_change(sensitivity, wanted, GOALS - 1, one)
-    sensitivity[GOALS - 1] *= -3.0
-    least_change(sensitivity, wanted, GOALS - 1, other)
+@pytest.mark.parametrize(("faster", "is_low"), [(0.0, True), (6.0, False)])
+@pytest.mark.parametrize("seed", [0, 2, 3])  # 1 looks down too much to clear the net
+def test_a_correction_asks_for_target_centre_and_where_it_lacks_height_over_the_net(seed, faster, is_low):
+    hit, condition = make_hit(seed), make_condition(seed)
+    hit[JOINT_VEL] += faster  # the rail towards the net
+    by_pos, by_vel, changes = np.empty((GOALS, 7)), np.empty((GOALS, 7)), np.empty((GOALS, BACK, 7))
+    x, y, side, up, over = hit_sensitivity(hit, condition, SIMPLE, by_pos, by_vel)
+    free, late = np.zeros((BACK, SUBSTEPS, 7), np.bool_), round(condition[Condition.ACTION_LATENCY] / H)
+    for goal in range(GOALS):
+        back_through_drives(
+            by_pos[goal], by_vel[goal], hit[MOMENT], free, 3, BACK, late, DRIVES, H, changes[goal]
+        )
+    target = np.clip(
+        condition[[Condition.TARGET_X, Condition.TARGET_Y]],
+        [NEAREST, EDGE - TABLE_HALF_WIDTH],
+        [TABLE_HALF_LENGTH - EDGE, TABLE_HALF_WIDTH - EDGE],
+    )
+    miss = target - [x, y]
+    miss *= min(1.0, LARGEST_MISS / np.linalg.norm(miss))
+    wanted = np.array([*miss, -side, -up, min(MARGIN - over, LARGEST_SHORTFALL)])
+    goals = GOALS if is_low else GOALS - 1
+    flat = changes[:goals].reshape(goals, -1)
+    expected = flat.T @ np.linalg.solve(flat @ flat.T + LEVENBERG * np.eye(goals), wanted[:goals])
+    found, _ = corrected(hit[None], condition[None])
 
-    np.testing.assert_array_equal(one, other)
+    assert (over < MARGIN) == is_low
+    np.testing.assert_allclose(found[0].ravel(), np.clip(expected, -0.2, 0.2), atol=1e-9)
+    if is_low:
+        assert (changes[GOALS - 1] * found[0]).sum() > 0
