@@ -52,7 +52,7 @@ DRIVES = np.array(
 
 def make_condition(seed=0) -> np.ndarray:
     condition = np.empty(CONDITIONS)
-    draw_conditions(seed, 1.0, 1.0, PROFILES["standard"], condition)
+    draw_conditions(np.uint64(seed), 1.0, 1.0, PROFILES["standard"], condition)
     return condition
 
 
