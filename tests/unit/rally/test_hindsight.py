@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.physics.arm import point_velocity, racket_motion, racket_pose
-from common.physics.constants import BALL_RADIUS, NET_HEIGHT
+from common.physics.constants import BALL_RADIUS, NET_HEIGHT, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import SIMPLE, flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
@@ -15,13 +15,18 @@ from common.rally.hindsight import (
     BALL_VEL,
     BOUNCE,
     CONTACT,
+    EDGE,
     FRESH,
     GOALS,
     HIT,
     JOINT_POS,
     JOINT_VEL,
+    LARGEST_MISS,
+    LARGEST_SHORTFALL,
     LEVENBERG,
+    MARGIN,
     MOMENT,
+    NEAREST,
     PACE,
     PLACE_WEIGHT,
     SOONEST,
@@ -33,7 +38,7 @@ from common.rally.hindsight import (
     hit_sensitivity,
     least_change,
 )
-from common.rally.noise import CONDITIONS, PROFILES, draw_conditions
+from common.rally.noise import CONDITIONS, PROFILES, Condition, draw_conditions
 from tests.unit.rally.scripted import HOME
 
 SUBSTEPS, H = 5, 0.004
@@ -51,7 +56,7 @@ DRIVES = np.array(
 
 def make_condition(seed=0) -> np.ndarray:
     condition = np.empty(CONDITIONS)
-    draw_conditions(seed, 1.0, 1.0, PROFILES["standard"], condition)
+    draw_conditions(np.uint64(seed), 1.0, 1.0, PROFILES["standard"], condition)
     return condition
 
 
@@ -264,12 +269,13 @@ def test_no_change_is_larger_than_half_the_trust():
         assert np.linalg.norm(out) <= 0.5 * TRUST + 1e-12
 
 
-def corrected(hits, condition=None, limited=None) -> tuple[np.ndarray, np.ndarray]:
+def corrected(hits, conditions=None) -> tuple[np.ndarray, np.ndarray]:
     """Return corrections (B, BACK, 7), 7 where nothing was written, and how far back they reach (B,)."""
     count = len(hits)
-    conditions = np.array([make_condition(b) for b in range(count)]) if condition is None else condition
+    if conditions is None:
+        conditions = np.array([make_condition(b) for b in range(count)])
     out, steps = np.full((count, BACK, 7), 7.0), np.full(count, -1)
-    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.bool_) if limited is None else limited
+    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.bool_)
     corrections(hits, conditions, SIMPLE, limited, 3, DRIVES, H, out, steps)
     return out, steps
 
@@ -324,3 +330,34 @@ def test_a_contact_too_soon_after_the_bounce_is_to_come_later_and_only_that():
 
     assert (later * delayed).sum() > 0.0
     assert (later * delayed).sum() > (later * as_it_was).sum()
+
+
+@pytest.mark.parametrize(("faster", "is_low"), [(0.0, True), (6.0, False)])
+@pytest.mark.parametrize("seed", [0, 2, 3])  # 1 looks down too much to clear the net
+def test_a_correction_asks_for_target_centre_and_where_it_lacks_height_over_the_net(seed, faster, is_low):
+    hit, condition = make_hit(seed), make_condition(seed)
+    hit[JOINT_VEL] += faster  # the rail towards the net
+    by_pos, by_vel, changes = np.empty((GOALS, 7)), np.empty((GOALS, 7)), np.empty((GOALS, BACK, 7))
+    x, y, side, up, over, _ = hit_sensitivity(hit, condition, SIMPLE, by_pos, by_vel)
+    free, late = np.zeros((BACK, SUBSTEPS, 7), np.bool_), round(condition[Condition.ACTION_LATENCY] / H)
+    for goal in range(GOALS):
+        back_through_drives(
+            by_pos[goal], by_vel[goal], hit[MOMENT], free, 3, BACK, late, DRIVES, H, changes[goal]
+        )
+    target = np.clip(
+        condition[[Condition.TARGET_X, Condition.TARGET_Y]],
+        [NEAREST, EDGE - TABLE_HALF_WIDTH],
+        [TABLE_HALF_LENGTH - EDGE, TABLE_HALF_WIDTH - EDGE],
+    )
+    miss = target - [x, y]
+    miss *= min(1.0, LARGEST_MISS / np.linalg.norm(miss))
+    wanted = np.array([*miss, -side, -up, min(MARGIN - over, LARGEST_SHORTFALL)])
+    goals = 5 if is_low else 4
+    flat = changes[:goals].reshape(goals, -1)
+    expected = flat.T @ np.linalg.solve(flat @ flat.T + LEVENBERG * np.eye(goals), wanted[:goals])
+    found, _ = corrected(hit[None], condition[None])
+
+    assert (over < MARGIN) == is_low
+    np.testing.assert_allclose(found[0].ravel(), expected / (1.0 + expected @ expected / TRUST**2), atol=1e-9)
+    if is_low:
+        assert (changes[4] * found[0]).sum() > 0

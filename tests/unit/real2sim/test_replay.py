@@ -71,7 +71,7 @@ def test_a_fitted_track_bounces_where_the_recording_did():
     track = seen(launch, noise=1e-3, jitter=0.35e-3)
     found = of_fits([fit(track)])
     condition = np.zeros((1, CONDITIONS))
-    draw_conditions(int(found.seeds[0]), *found.launches[0, 9:], PROFILES["off"], condition[0])
+    draw_conditions(found.seeds[0], *found.launches[0, 9:], PROFILES["off"], condition[0])
     bounces, _ = undisturbed(found.launches, condition, SIMPLE)
 
     assert found.valid[0]
