@@ -26,15 +26,18 @@ ESTIMATE, RECORDED, REFUSED, SHOT = PALETTE[0], PALETTE[1], PALETTE[3], "#A0A0A0
 WHEN: Final = 7  # column of ``RecordedRally.seen``
 EVENTS: Final = ("bounce", "racket", "landing")  # by which state begins with them: 1, 2, 3
 ROOM: Final = 0.08  # [-] of an axis' span, around the ball: a gross error may lie outside
+AFTER: Final = 0.25  # [s] that are shown after the last touch
+FARTHEST: Final = 1.7  # [m] from the net, in space
 UNITS: Final = ("x [m]", "y [m]", "z [m]")
 
 
 def flight(rally: RecordedRally, track: Track | None, title: str) -> Figure:
     """Return one recording as it was played: on the left in space, on the right by axis, with the estimate's error."""
-    figure = Figure(figsize=(11, 6.2), layout="constrained")
+    figure = Figure(figsize=(11, 5.8), layout="constrained")
     halves: Any = figure.subfigures(1, 2, width_ratios=(1.15, 1))  # Any: typed as one subfigure
     left, right = halves
-    space: Any = left.add_subplot(projection="3d")
+    # drawn in the order of the calls: matplotlib's own guess puts the table before the ball
+    space: Any = left.add_axes((-0.02, 0.06, 0.98, 0.98), projection="3d", computed_zorder=False)
     _hall(space, rally)
     axes = right.subplots(4, 1, sharex=True, height_ratios=(1, 1, 1, 0.7))
     _in_space(space, rally, track)
@@ -45,6 +48,7 @@ def flight(rally: RecordedRally, track: Track | None, title: str) -> Figure:
     axes[3].set_xlabel("time since launch [s]")
     handles, labels = axes[0].get_legend_handles_labels()
     left.legend(handles, labels, loc="lower center", ncols=2, fontsize=8.5)
+    figure.align_ylabels(list(axes))
     figure.suptitle(title, x=0.01, ha="left", fontsize=10.5)
     return figure
 
@@ -63,34 +67,45 @@ def _hall(space: Any, rally: RecordedRally) -> None:
     space.add_collection3d(
         Poly3DCollection([net], facecolor="#BBBBBB", edgecolor="#777777", linewidth=0.6, alpha=0.35)
     )
-    low = np.minimum(rally.ball_pos.min(axis=0), [-x, -y, 0.0])
-    high = np.maximum(rally.ball_pos.max(axis=0), [x, y, 0.45])
+    ball = rally.ball_pos[_over_table(rally.ball_pos)]
+    low = np.minimum(ball.min(axis=0), [-x, -NET_HALF_WIDTH, 0.0])
+    high = np.maximum(ball.max(axis=0), [x, NET_HALF_WIDTH, 0.45])
     for name, a, b in zip("xyz", low, high, strict=True):
         getattr(space, f"set_{name}lim")(a - 0.03, b + 0.03)
         axis = getattr(space, f"{name}axis")
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis._axinfo["grid"]["color"] = "#EEEEEE"  # there is no other way to make it faint
-    space.set_box_aspect(high - low + 0.06, zoom=1.15)
-    space.view_init(elev=20, azim=-68)
-    space.set_xlabel("x [m]", labelpad=12)
-    space.set_ylabel("y [m]")
-    space.set_zlabel("z [m]", labelpad=-2)
+    space.set_box_aspect(high - low + 0.06, zoom=1.0)
+    space.view_init(elev=24, azim=-72)
+    space.set_proj_type("ortho")
+    space.set_xlabel("x [m]", labelpad=8)
+    space.set_ylabel("y [m]", labelpad=2)
+    space.set_zlabel("z [m]", labelpad=-8)
     space.tick_params(labelsize=7.5, pad=0)
+    space.set_xticks([-1, 0, 1])
     space.set_yticks([-0.5, 0, 0.5])
     space.set_zticks([0, 0.4])
 
 
+def _over_table(positions: Array) -> npt.NDArray[np.bool_]:
+    """Return which positions (n, 3) are drawn in space: what falls beside the table would make all else small."""
+    over: npt.NDArray[np.bool_] = (positions[:, 2] > 0.0) & (np.abs(positions[:, 0]) < FARTHEST)
+    return over
+
+
 def _in_space(space: Any, rally: RecordedRally, track: Track | None) -> None:
-    space.plot(*rally.ball_pos.T, color=INK, linewidth=1.1)
-    if len(rally.shots):
-        believed = rally.shots[:, 4] > 0
-        space.scatter(*rally.shots[believed, 1:4].T, color=SHOT, s=5, linewidths=0, depthshade=False)
-    for piece in _pieces(rally):
-        space.plot(*piece[:, :3].T, color=ESTIMATE, linewidth=1.1)
     if track is not None:
-        space.scatter(
-            *track.positions.T, facecolors="none", edgecolors=RECORDED, s=9, linewidths=0.6, depthshade=False
+        space.plot(
+            *track.positions.T, "o", color=RECORDED, markersize=4.5, markerfacecolor="none", alpha=0.45
         )
+    if len(rally.shots):
+        shots = rally.shots[(rally.shots[:, 4] > 0) & _over_table(rally.shots[:, 1:4])]
+        space.plot(*shots[:, 1:4].T, ".", color=SHOT, markersize=4)
+    ball = rally.ball_pos[_over_table(rally.ball_pos)]
+    space.plot(*ball.T, color=INK, linewidth=1.1)
+    for piece in _pieces(rally):
+        here = piece[_over_table(piece[:, :3])]
+        space.plot(*here[:, :3].T, ".-", color=ESTIMATE, markersize=2.5, linewidth=0.8)
     space.scatter(*rally.target, 0.0, marker="x", color=INK, s=30, linewidths=1.2)
     space.text(*rally.target, 0.0, "  target", fontsize=7.5)
 
@@ -102,11 +117,16 @@ def _pieces(rally: RecordedRally) -> list[Array]:
 
 
 def _by_axis(ax: Axes, rally: RecordedRally, track: Track | None, k: int) -> None:
-    ball = rally.ball_pos[:, k]
+    ball = rally.ball_pos[rally.time <= _end(rally), k]
+    if track is not None:
+        ax.plot(
+            track.times, track.positions[:, k], "o", color=RECORDED, markersize=5.5, markerfacecolor="none",
+            alpha=0.45, label="recorded samples",
+        )  # fmt: skip
     if len(rally.shots):
         believed = rally.shots[:, 4] > 0
         ax.plot(
-            *rally.shots[believed][:, (0, 1 + k)].T, ".", color=SHOT, markersize=4, label="camera's shots"
+            *rally.shots[believed][:, (0, 1 + k)].T, ".", color=SHOT, markersize=5, label="camera's shots"
         )
         if not believed.all():
             refused = rally.shots[~believed]
@@ -118,12 +138,7 @@ def _by_axis(ax: Axes, rally: RecordedRally, track: Track | None, k: int) -> Non
                 label="shots not believed",
                 zorder=3,
             )
-    if track is not None:
-        ax.plot(
-            track.times, track.positions[:, k], "o", color=RECORDED, markersize=3.5, markerfacecolor="none",
-            markeredgewidth=0.7, label="recorded samples",
-        )  # fmt: skip
-    ax.plot(rally.time, ball, color=INK, linewidth=1.1, label="ball in the simulation")
+    ax.plot(rally.time, rally.ball_pos[:, k], color=INK, linewidth=1.1, label="ball in the simulation")
     for n, piece in enumerate(_pieces(rally)):
         ax.plot(
             piece[:, WHEN], piece[:, k], ".-", color=ESTIMATE, markersize=3.5, linewidth=1.0,
@@ -141,24 +156,35 @@ def _errors(ax: Axes, rally: RecordedRally) -> None:
     truth = np.array([position_at(path, float(moment)) for moment in moments])
     far = 1000.0 * np.linalg.norm(rally.seen[:, :3] - truth, axis=1)
     ax.plot(moments, far, ".-", color=ESTIMATE, markersize=3.5, linewidth=1.0)
-    ax.set_ylim(0, max(15.0, 1.15 * float(np.quantile(far, 0.97))))
+    ax.set_yscale("log")  # a few mm, and a few dm for an instant behind the racket
+    ax.set_ylim(0.3, 1000)
+    ax.set_yticks([1, 10, 100], ["1", "10", "100"])
+    ax.minorticks_off()
     ax.set_ylabel("error [mm]")
 
 
 def _events(axes: list[Axes], rally: RecordedRally) -> None:
     """Mark when the ball touched something."""
+    axes[0].set_xlim(-0.02, _end(rally) + 0.01)
     for k, (before, after) in enumerate(pairwise(rally.state)):
         if after > before:
-            moment = rally.time[k + 1]
+            moment = float(rally.time[k + 1])
             for ax in axes:
                 ax.axvline(moment, color=FAINT, linewidth=1.2, zorder=0.5)
             axes[0].annotate(
                 EVENTS[int(after) - 1],
                 (moment, 1.0),
                 xycoords=("data", "axes fraction"),
-                xytext=(0, 2),
+                xytext=(4 if after == 2 else -4 if after == 1 else 0, 2),
                 textcoords="offset points",
-                ha="center",
+                ha=("right", "left", "center")[int(after) - 1],
                 fontsize=8,
                 color="#777777",
             )
+
+
+def _end(rally: RecordedRally) -> float:
+    """Return how long is shown [s]: what comes long after the ball's last touch is left out."""
+    touches = np.flatnonzero(np.diff(rally.state) > 0)
+    end = float(rally.time[-1])
+    return min(end, float(rally.time[touches[-1] + 1]) + AFTER) if len(touches) else end

@@ -136,11 +136,16 @@ def test_a_driven_rallys_validity_is_its_paths():
     np.testing.assert_array_equal(found.launches[:, 6:], [fitted.launch[6:] for fitted in fits])
 
 
-def test_a_path_into_the_net_is_no_rally():
-    track = seen(launch_of(vel=(-5.0, 0.0, 0.3)), duration=0.5, table=np.empty(0))
-    path = np.zeros((1 + len(track.times), 6))
+def test_what_a_driven_ball_touches_first_is_its_paths():
+    grid = GRID_STEP * np.arange(100)
+    path = np.zeros((101, 6))
+    path[0, PATH_ROWS] = path[0, PATH_BOUNCE] = 100
+    low, pos, vel = launch_of(vel=(-5.0, 0.0, 0.9)), np.empty((100, 3)), np.empty((100, 3))
+    predict(low, np.empty(0), SIMPLE, grid, pos, vel)
+    path[1:] = np.hstack([pos, vel])
 
-    assert first_touch(launch_of(vel=(-5.0, 0.0, 0.3)), path, SIMPLE, NO_ROBOT) == touch.NET
+    assert first_touch(LAUNCH, np.zeros((1, 6)), SIMPLE, NO_ROBOT) == touch.ROBOT_COURT
+    assert first_touch(LAUNCH, path, SIMPLE, NO_ROBOT) == touch.NET
 
 
 def test_a_path_asks_for_our_collisions():
