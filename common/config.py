@@ -34,6 +34,7 @@ SECTIONS: Final = (
     "local",
     "play",
     "pictures",
+    "real2sim",
     "report",
     "ship",
 )

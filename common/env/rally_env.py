@@ -95,6 +95,7 @@ class Launches:
     records: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
     seeds: npt.NDArray[np.uint64]  # (n,)
     validated: Flags  # (n,) False: a random launch that no generator flew; left out of all rates
+    paths: Array | None = None  # (n, path_rows, 6) as play.Rallies.driven, where the environment drives balls
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,11 +169,20 @@ class RallyEnv:
         source: Where rallies come from.
         stage: Curriculum stage 1..3, the reward's column.
         threads: MuJoCo threads.
+        path_rows: Rows of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """
 
     def __init__(
-        self, count: int, config: EnvConfig, source: RallySource, stage: int = 1, threads: int = 1
+        self,
+        count: int,
+        config: EnvConfig,
+        source: RallySource,
+        stage: int = 1,
+        threads: int = 1,
+        path_rows: int = 0,
     ) -> None:
+        if path_rows and config.collision == "original":
+            raise ValueError("a path under collision 'original': allowed is 'tailored', or no path")
         self.count = count
         self.config = config
         self._flight_model = SIMPLE if config.flight == "simple" else FULL
@@ -188,6 +198,7 @@ class RallyEnv:
             full=config.perception == "full",
             tracked=config.observation.spin == "estimated",
             reviewed=self._review is not None,
+            path_rows=path_rows,
         )
         self._validated = np.zeros(count, np.bool_)
         self._returns = np.zeros(count)
@@ -334,6 +345,9 @@ class RallyEnv:
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
         """Launch the next rallies on ``rows``; where ``same_episode`` the robot goes on as it stands."""
         launches = self._source.take(rows.size)
+        if self._rallies.driven.size:
+            # balls without a path have one of no rows
+            self._rallies.driven[rows] = 0.0 if launches.paths is None else launches.paths
         play.launch_rallies(self._rallies, rows, launches.records, launches.seeds, self.noise)
         self._validated[rows] = launches.validated
         self._returns[rows] = 0.0

@@ -44,6 +44,7 @@ MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
 SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
+PATH_ROWS, PATH_BOUNCE = 0, 1  # columns of the first row of a path in ``Rallies.driven``
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -76,6 +77,9 @@ class Rallies(NamedTuple):
     eyes: Array
     track: Array  # (B, TRACK) what the samples tell of the spin; no rows: nobody asks
     hit: Array  # (B, HIT) ball and joints at the last legal contact; no rows: nobody asks
+    # (B, 1 + n, 6) a path that the ball keeps to until it is hit: (rows, first row after the bounce, 0 ...), then
+    # position and velocity on the grid, the launch first; no rows: balls fly as physics has it
+    driven: Array
     last_action: Array  # (B, 7)
 
 
@@ -131,7 +135,12 @@ class Flown(NamedTuple):
 
 
 def allocate(
-    count: int, history: int = 0, full: bool = False, tracked: bool = False, reviewed: bool = False
+    count: int,
+    history: int = 0,
+    full: bool = False,
+    tracked: bool = False,
+    reviewed: bool = False,
+    path_rows: int = 0,
 ) -> tuple[Rallies, Step]:
     """Return zeroed rows for ``count`` rallies.
 
@@ -141,6 +150,7 @@ def allocate(
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
         tracked: Whether spin is estimated.
         reviewed: Whether contacts are kept, for ``hindsight``.
+        path_rows: Rows of ``Rallies.driven`` a rally, its first one included; 0: no ball is driven.
     """
     rallies = Rallies(
         ball=np.zeros((count, 9)),
@@ -162,6 +172,7 @@ def allocate(
         eyes=np.zeros((count if full else 0, FILM + ESTIMATE)),
         track=np.zeros((count if tracked else 0, TRACK)),
         hit=np.zeros((count if reviewed else 0, HIT)),
+        driven=np.zeros((count if path_rows else 0, path_rows, 6)),
         last_action=np.zeros((count, 7)),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
@@ -344,6 +355,29 @@ def shoot(
 
 
 @kernel
+def keep_to_path(path: Array, step: int, state: int, pos: Vec, vel: Vec) -> tuple[Vec, Vec]:
+    """Return where a driven ball is after ``step`` grid steps, and its velocity.
+
+    Between two rows it flies as physics has it, 5 ms at a time, so that touches are found where they always are; a
+    row then puts it back on its path, a tenth of a millimetre away. So the bounce, and what it does to the spin, is
+    physics' too, a grid step sooner or later than the path's: while the two disagree on whether it has been, the
+    ball is left alone.
+
+    Args:
+        path: Of one ball, as in ``Rallies.driven`` (1 + n, 6).
+        step: Since the launch, now.
+        state: Trajectory state now.
+        pos: Where physics takes it [m].
+        vel: And its velocity [m/s].
+    """
+    has_bounced = step >= path[0, PATH_BOUNCE]
+    if step >= path[0, PATH_ROWS] or state >= _TAU_2 or has_bounced != (state >= _TAU_1):
+        return pos, vel
+    row = path[1 + step]
+    return (row[0], row[1], row[2]), (row[3], row[4], row[5])
+
+
+@kernel
 def film(rallies: Rallies, b: int, pos: Vec, vel: Vec, state: int) -> None:
     """Let a grid step pass: put the camera's true sample into the ring."""
     rallies.clock[b] += 1
@@ -374,6 +408,7 @@ def _fly_one(
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
     state = rallies.state[b]
     filmed, reviewed = rallies.eyes.shape[0] > 0, rallies.hit.shape[0] > 0
+    driven = rallies.driven.shape[0] > 0
     if reviewed:
         rallies.hit[b, FRESH] = 0.0
     outcome = 0
@@ -451,6 +486,8 @@ def _fly_one(
             )
             if outcome != 0:
                 break
+        if driven and outcome == 0:
+            pos, vel = keep_to_path(rallies.driven[b], rallies.clock[b] + 1, state, pos, vel)
         film(rallies, b, pos, vel, state)
         if outcome != 0:
             break

@@ -35,8 +35,11 @@ def load(path: Path, *, turn: bool = False) -> Recordings:
     raise RecordingError(f"{path}: got a {suffix or 'nameless'} file; allowed: {', '.join(SUFFIXES)}")
 
 
-def load_folder(folder: Path, pattern: str = "*") -> tuple[Recordings, ...]:
-    """Return the recordings of every file in a folder that matches ``pattern`` and has a known suffix, by name."""
+def load_folder(folder: Path, pattern: str = "*", *, turn: bool = False) -> tuple[Recordings, ...]:
+    """Return the recordings of every file in a folder that matches ``pattern`` and has a known suffix, by name.
+
+    ``turn`` as for ``load``.
+    """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder")
     paths = sorted(path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES)
@@ -44,4 +47,4 @@ def load_folder(folder: Path, pattern: str = "*") -> tuple[Recordings, ...]:
         raise RecordingError(
             f"{folder}: no recordings; allowed: files {pattern} ending in {', '.join(SUFFIXES)}"
         )
-    return tuple(load(path) for path in paths)
+    return tuple(load(path, turn=turn) for path in paths)

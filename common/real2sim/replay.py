@@ -9,6 +9,7 @@ plays rallies can play these.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +31,10 @@ from common.rally.launch import (
     is_valid,
 )
 from common.rally.noise import PROFILES
-from common.real2sim.identify import Fit
 from common.real2sim.tracks import Array, RecordingError, States
+
+if TYPE_CHECKING:  # the fit needs scipy, an extra: states go without
+    from common.real2sim.identify import Fit
 
 Flags = npt.NDArray[np.bool_]
 
@@ -46,6 +49,8 @@ class RecordedRallies:
         launches: (n, 11) position, velocity, spin, drag factor, lift factor.
         seeds: (n,) what the rest of each rally is drawn from.
         valid: (n,) whether it crosses the net untouched and touches the robot's court first.
+        paths: (n, 1 + m, 6) that the balls keep to until they are hit, as ``play.Rallies.driven``; None: they
+            fly as physics has it.
     """
 
     ids: tuple[str, ...]
@@ -53,6 +58,7 @@ class RecordedRallies:
     launches: Array
     seeds: Seeds
     valid: Flags
+    paths: Array | None = None
 
     def block(self) -> RallyBlock:
         """Return the valid ones as a generator's block, to be played like any.
@@ -65,7 +71,8 @@ class RecordedRallies:
                 f"got {len(self.ids)} recorded balls, none of which crosses the net and touches the robot's court "
                 "first; allowed: one or more that does"
             )
-        return RallyBlock(self.launches[self.valid], self.seeds[self.valid], len(self.ids))
+        paths = None if self.paths is None else self.paths[self.valid]
+        return RallyBlock(self.launches[self.valid], self.seeds[self.valid], len(self.ids), paths)
 
 
 @kernel
@@ -123,7 +130,7 @@ def of_states(
     return _recorded(states.ids, states.labels, launches, seeds, flight)
 
 
-def of_fits(fits: Sequence[Fit], labels: Sequence[str] = (), *, seed: int = 0) -> RecordedRallies:
+def of_fits(fits: Sequence["Fit"], labels: Sequence[str] = (), *, seed: int = 0) -> RecordedRallies:
     """Return fitted tracks as rallies: launched where the recording begins, in the air that was fitted.
 
     Args:

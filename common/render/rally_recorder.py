@@ -5,7 +5,7 @@ in between they follow the cubic that has their positions and velocities.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -13,9 +13,10 @@ import numpy.typing as npt
 
 from common.env.rally_env import EnvConfig, Launches, RallyEnv
 from common.physics.constants import GRID_STEP
+from common.rally.camera import FILM, READ, SHOT, SHOTS, shot_row
 from common.rally.launch import RallyBlock
 from common.rally.noise import Condition
-from common.rally.play import RING
+from common.rally.play import RING, SAMPLE
 from common.rally.trajectory import Outcome
 
 Array = npt.NDArray[np.float64]
@@ -41,6 +42,10 @@ class RecordedRally:
     ball_spin: Array  # (n, 3) [rad/s]
     ball_turn: Array  # (n, 4) quaternion (w, x, y, z): how far its spin has turned the ball since launch
     state: Integers  # (n,) 0 tau_01, 1 tau_12, 2 tau_23, 3 tau_30
+    # (m, 8) what the robot went by after each control step: position, velocity, state, and when it was so [s]
+    seen: Array = field(default_factory=lambda: np.empty((0, SAMPLE + 1)))
+    # (s, 5) the simulated camera's shots that arrived: when, position, 1 if believed; none if perception is cheap
+    shots: Array = field(default_factory=lambda: np.empty((0, SHOT)))
 
 
 class _Dealer:
@@ -53,8 +58,8 @@ class _Dealer:
     def take(self, count: int) -> Launches:
         """Return the first ``count`` rallies; after the first call they are filler that nobody looks at."""
         self.before_dealing()
-        rows = slice(0, count)
-        return Launches(self._rallies.launches[rows], self._rallies.seeds[rows], np.ones(count, np.bool_))
+        dealt = self._rallies.of(np.arange(count))
+        return Launches(dealt.launches, dealt.seeds, np.ones(count, np.bool_), dealt.paths)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +72,8 @@ class _Moment:
     spin: Array  # (B, 3)
     joint_pos: Array  # (B, 7)
     joint_vel: Array  # (B, 7)
+    seen: Array  # (B, 8)
+    eyes: Array  # (B, FILM + ESTIMATE), or no rows
 
 
 def record(act: Act, rallies: RallyBlock, config: EnvConfig) -> list[RecordedRally]:
@@ -80,7 +87,7 @@ def record(act: Act, rallies: RallyBlock, config: EnvConfig) -> list[RecordedRal
     count = len(rallies.seeds)
     dealer = _Dealer(rallies)
     played = config.model_copy(update={"go_on": 0.0, "foresee": 0.0, "rounds": _PLAYED_ON})
-    env = RallyEnv(count, played, dealer, stage=3)
+    env = RallyEnv(count, played, dealer, stage=3, path_rows=rallies.path_rows)
     obs = env.reset()
     targets = env.rallies.condition[:, Condition.TARGET_X : Condition.TARGET_Y + 1].copy()
     moments = [_moment(env)]
@@ -117,6 +124,8 @@ def _moment(env: RallyEnv) -> _Moment:
         rallies.ball[:, 6:9].copy(),
         robot.joint_pos.copy(),
         robot.joint_vel[:, :7].copy(),
+        rallies.seen.copy(),
+        rallies.eyes.copy(),
     )
 
 
@@ -162,7 +171,25 @@ def _assembled(
         ball_spin=spin,
         ball_turn=turned(spin, GRID_STEP),
         state=ball[:, 6].astype(np.int64),
+        seen=np.array([moment.seen[row] for moment in moments]),
+        shots=_shots(moments, row),
     )
+
+
+def _shots(moments: list[_Moment], row: int) -> Array:
+    """Return the shots (s, 5) of row ``row``'s ball that arrived, in order.
+
+    A film keeps the last 32, which are more than a control step takes and latency holds back, so that every shot is
+    there after the step in which it arrives.
+    """
+    found: dict[int, Array] = {}
+    for moment in moments:
+        if len(moment.eyes):
+            film = moment.eyes[row, :FILM]
+            arrived = int(film[READ])
+            for shot in range(max(0, arrived - SHOTS // 2), arrived):
+                found[shot] = shot_row(film, shot).copy()
+    return np.array([found[shot] for shot in sorted(found)]).reshape(-1, SHOT)
 
 
 def between_control_steps(pos: Array, vel: Array, period: float, time: Array) -> Array:

@@ -1,6 +1,6 @@
 """Run the evaluator: `python -m services.evaluator`; with --policy it plays once and ends.
 
-`play`, `pictures`, `report` and `ship` as first argument are commands of their own, with their own --help.
+`play`, `pictures`, `real2sim`, `report` and `ship` as first argument are commands of their own, with their own --help.
 """
 
 import os
@@ -18,6 +18,7 @@ from common.process import DONE, run_service
 from common.service_config import new_incarnation
 from services.evaluator import once, pictures, play, ship
 from services.evaluator.config import EvaluatorConfig
+from services.evaluator.real2sim import command as real2sim
 from services.evaluator.report import command as report
 from services.evaluator.service import EvaluatorService
 
@@ -27,6 +28,7 @@ PROG = "python -m services.evaluator"
 SUBCOMMANDS: Final[dict[str, Callable[[Sequence[str], Event], int]]] = {
     "play": play.main,
     "pictures": pictures.main,
+    "real2sim": real2sim.main,
     "report": report.main,
     "ship": ship.main,
 }

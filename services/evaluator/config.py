@@ -12,7 +12,7 @@ from common.service_config import ServiceConfig
 class EvaluatorConfig(ServiceConfig):
     """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best.
 
-    Commands with settings of their own, in the place of flags: `play`, `pictures`, `report RUN...`, `ship`.
+    Commands with settings of their own, in the place of flags: `play`, `pictures`, `real2sim`, `report RUN...`, `ship`.
     """
 
     policy: str = Field("", description="policy folder to play once; empty: follow the run")

@@ -38,10 +38,15 @@ class FixedRallies:
         extra = (self._filled + np.arange(count - fresh)) % len(self._filler.seeds)
         self._dealt += fresh
         self._filled += count - fresh
+        paths = None
+        if self._rallies.paths is not None:  # filler flies freely: its paths have no rows
+            paths = np.zeros((count, *self._rallies.paths.shape[1:]))
+            paths[:fresh] = self._rallies.paths[rows]
         return Launches(
             np.concatenate((self._rallies.launches[rows], self._filler.launches[extra])),
             np.concatenate((self._rallies.seeds[rows], self._filler.seeds[extra])),
             np.arange(count) < fresh,
+            paths,
         )
 
 
@@ -75,7 +80,7 @@ def play_match(
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
     # What only training asks for has no place in a match: every flight is played to its end, and nobody is taught.
     task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0, "hindsight": False})
-    env = RallyEnv(envs, task, FixedRallies(rallies, filler), stage=3)
+    env = RallyEnv(envs, task, FixedRallies(rallies, filler), stage=3, path_rows=rallies.path_rows)
     obs = env.reset()
     ended: list[FinishedRallies] = []
     left = len(rallies.seeds)

@@ -91,9 +91,9 @@ def _commands(found: Results) -> str:
     return "\n".join(lines)
 
 
-def as_markdown(parts: Sequence[Section]) -> str:
+def as_markdown(parts: Sequence[Section], title: str = TITLE) -> str:
     """Return the page as Markdown with its plots beside it."""
-    lines = [f"# {TITLE}"]
+    lines = [f"# {title}"]
     for part in parts:
         if part.title:
             lines.append(f"## {part.title}")
@@ -115,7 +115,7 @@ def as_markdown(parts: Sequence[Section]) -> str:
     return "\n\n".join(lines) + "\n"
 
 
-def as_html(parts: Sequence[Section], folder: Path) -> str:
+def as_html(parts: Sequence[Section], folder: Path, title: str = TITLE) -> str:
     """Return the page as HTML that stands alone; the plots are read from ``folder``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=True
@@ -125,7 +125,7 @@ def as_html(parts: Sequence[Section], folder: Path) -> str:
         for part in parts
         for drawing in part.drawings
     }
-    return environment.get_template("page.html.j2").render(title=TITLE, sections=parts, images=images)
+    return environment.get_template("page.html.j2").render(title=title, sections=parts, images=images)
 
 
 def write(found: Results, drawings: Sequence[Drawing], folder: Path) -> None:

@@ -178,10 +178,11 @@ def outcomes(found: Results) -> Table:
 def by_kind(found: Results) -> list[Table]:
     """Return a table for each way to tell balls apart."""
     groups = [one for one in found.groups if one.played is not None]
-    return [_kind_table(key, groups) for key in BREAKDOWNS] if groups else []
+    return [kind_table(key, groups) for key in BREAKDOWNS] if groups else []
 
 
-def _kind_table(key: str, groups: Sequence[GroupResult]) -> Table:
+def kind_table(key: str, groups: Sequence[GroupResult]) -> Table:
+    """Return the table of one way to tell balls apart, a key of BREAKDOWNS."""
     kind = BREAKDOWNS[key]
     found: list[Mapping[str, Mapping[str, Any]]] = [
         {entry["bin"]: entry for entry in one.by[key]} for one in groups
