@@ -134,6 +134,13 @@ METRICS: Final = _table(
     Metric("topspin_clip_fraction", "gauge", "share", "Samples whose ratio was clipped", (_L,)),
     Metric("topspin_entropy", "gauge", "nat", "Entropy of the action distribution", (_L,)),
     Metric("topspin_policy_loss", "gauge", "1", "Loss of the policy", (_L,)),
+    Metric(
+        "topspin_correction_loss",
+        "gauge",
+        "1",
+        "Of the mean against what the actions should have been",
+        (_L,),
+    ),
     Metric("topspin_value_loss", "gauge", "1", "Loss of the value, normalised", (_L,)),
     Metric("topspin_explained_variance", "gauge", "share", "Of the returns, by the value", (_L,)),
     Metric("topspin_gradient_norm", "gauge", "1", "Before clipping", (_L,)),

@@ -48,6 +48,7 @@ def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, flo
     result.update(
         {f"outcome_{o.name.lower()}": int(play.outcomes[o]) for o in Outcome if o is not Outcome.NONE}
     )
+    result["correction_loss"] = update.correction_loss
     return result
 
 

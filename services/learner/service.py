@@ -475,6 +475,7 @@ class LearnerService:
             "topspin_clip_fraction": update.clip_fraction,
             "topspin_entropy": update.entropy,
             "topspin_policy_loss": update.policy_loss,
+            "topspin_correction_loss": update.correction_loss,
             "topspin_value_loss": update.value_loss,
             "topspin_explained_variance": update.explained_variance,
             "topspin_gradient_norm": update.gradient_norm,
