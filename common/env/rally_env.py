@@ -95,7 +95,7 @@ class Launches:
     records: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
     seeds: npt.NDArray[np.uint64]  # (n,)
     validated: Flags  # (n,) False: a random launch that no generator flew; left out of all rates
-    paths: Array | None = None  # (n, path_rows, 6) as play.Rallies.driven, where the environment drives balls
+    paths: Array | None = None  # (n, path_rows, 7) as play.keep_to_path, where the environment drives balls
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class RallyEnv:
         source: Where rallies come from.
         stage: Curriculum stage 1..3, the reward's column.
         threads: MuJoCo threads.
-        path_rows: Rows of a path that balls keep to until they are hit; 0: they fly as physics has it.
+        path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """
 
     def __init__(
@@ -345,9 +345,8 @@ class RallyEnv:
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
         """Launch the next rallies on ``rows``; where ``same_episode`` the robot goes on as it stands."""
         launches = self._source.take(rows.size)
-        if self._rallies.driven.size:
-            # balls without a path have one of no rows
-            self._rallies.driven[rows] = 0.0 if launches.paths is None else launches.paths
+        path = self._rallies.camera[:, play.RING :]
+        path[rows] = play.NO_SAMPLE if launches.paths is None else launches.paths
         play.launch_rallies(self._rallies, rows, launches.records, launches.seeds, self.noise)
         self._validated[rows] = launches.validated
         self._returns[rows] = 0.0

@@ -55,7 +55,7 @@ class RallyBlock:
         launches: (n, 11) float64: position, velocity, spin, drag factor, lift factor.
         seeds: (n,) uint64: what the rest of each rally is drawn from.
         drawn: How many candidates were drawn for these n.
-        paths: (n, 1 + m, 6) float64 that the balls keep to until they are hit, as ``play.Rallies.driven``; None:
+        paths: (n, m, 7) float64 that the balls keep to until they are hit, as ``play.keep_to_path``; None:
             they fly as physics has it.
     """
 
@@ -66,7 +66,7 @@ class RallyBlock:
 
     @property
     def path_rows(self) -> int:
-        """Return how many rows a path has, its first one included; 0: there is none."""
+        """Return how many samples a path has room for; 0: there is none."""
         return 0 if self.paths is None else self.paths.shape[1]
 
     def of(self, rows: npt.NDArray[np.int64]) -> "RallyBlock":

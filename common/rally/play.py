@@ -44,7 +44,7 @@ MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
 SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
-PATH_ROWS, PATH_BOUNCE = 0, 1  # columns of the first row of a path in ``Rallies.driven``
+NO_SAMPLE = -1.0  # state of a sample that is none: a path ends before it
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -67,7 +67,9 @@ class Rallies(NamedTuple):
     over: npt.NDArray[np.bool_]  # (B,) and it crossed the net after that
     landing: Array  # (B, 2) [m] where the ball landed; nan before a legal landing
     landing_error: Array  # (B,) [m] planar distance of that to the target
-    camera: Array  # (B, RING, 7) true samples on the grid, newest at ``head``
+    # (B, RING + n, 7) true samples on the grid: a ring of those that were, newest at ``head``, and a path of those to
+    # come, from the launch on, to which a ball keeps until it is hit. Not an array of its own: see ``eyes``
+    camera: Array
     head: Integers  # (B,)
     # (B, 8) the sample that the robot goes by: late, noisy, sometimes held; and when it was taken [s since launch]
     seen: Array
@@ -77,9 +79,6 @@ class Rallies(NamedTuple):
     eyes: Array
     track: Array  # (B, TRACK) what the samples tell of the spin; no rows: nobody asks
     hit: Array  # (B, HIT) ball and joints at the last legal contact; no rows: nobody asks
-    # (B, 1 + n, 6) a path that the ball keeps to until it is hit: (rows, first row after the bounce, 0 ...), then
-    # position and velocity on the grid, the launch first; no rows: balls fly as physics has it
-    driven: Array
     last_action: Array  # (B, 7)
 
 
@@ -150,7 +149,7 @@ def allocate(
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
         tracked: Whether spin is estimated.
         reviewed: Whether contacts are kept, for ``hindsight``.
-        path_rows: Rows of ``Rallies.driven`` a rally, its first one included; 0: no ball is driven.
+        path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """
     rallies = Rallies(
         ball=np.zeros((count, 9)),
@@ -165,14 +164,13 @@ def allocate(
         over=np.zeros(count, np.bool_),
         landing=np.full((count, 2), np.nan),
         landing_error=np.full(count, np.nan),
-        camera=np.zeros((count, RING, SAMPLE)),
+        camera=np.zeros((count, RING + path_rows, SAMPLE)),
         head=np.zeros(count, np.int64),
         seen=np.zeros((count, SAMPLE + 1)),
         earlier=np.zeros((count, history, 6)),
         eyes=np.zeros((count if full else 0, FILM + ESTIMATE)),
         track=np.zeros((count if tracked else 0, TRACK)),
         hit=np.zeros((count if reviewed else 0, HIT)),
-        driven=np.zeros((count if path_rows else 0, path_rows, 6)),
         last_action=np.zeros((count, 7)),
     )
     step = Step(np.zeros(count), np.zeros((count, 8)), np.zeros(count, np.int64), np.zeros((count, 6)))
@@ -364,16 +362,18 @@ def keep_to_path(path: Array, step: int, state: int, pos: Vec, vel: Vec) -> tupl
     ball is left alone.
 
     Args:
-        path: Of one ball, as in ``Rallies.driven`` (1 + n, 6).
+        path: Samples on the grid, the launch first: position, velocity, 0 before the bounce and 1 after it; from its
+            end on ``NO_SAMPLE`` (n, 7).
         step: Since the launch, now.
         state: Trajectory state now.
         pos: Where physics takes it [m].
         vel: And its velocity [m/s].
     """
-    has_bounced = step >= path[0, PATH_BOUNCE]
-    if step >= path[0, PATH_ROWS] or state >= _TAU_2 or has_bounced != (state >= _TAU_1):
+    if step >= path.shape[0] or state >= _TAU_2:
         return pos, vel
-    row = path[1 + step]
+    row = path[step]
+    if row[6] != (1.0 if state >= _TAU_1 else 0.0):
+        return pos, vel
     return (row[0], row[1], row[2]), (row[3], row[4], row[5])
 
 
@@ -408,7 +408,7 @@ def _fly_one(
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
     state = rallies.state[b]
     filmed, reviewed = rallies.eyes.shape[0] > 0, rallies.hit.shape[0] > 0
-    driven = rallies.driven.shape[0] > 0
+    driven = rallies.camera.shape[1] > RING
     if reviewed:
         rallies.hit[b, FRESH] = 0.0
     outcome = 0
@@ -487,7 +487,7 @@ def _fly_one(
             if outcome != 0:
                 break
         if driven and outcome == 0:
-            pos, vel = keep_to_path(rallies.driven[b], rallies.clock[b] + 1, state, pos, vel)
+            pos, vel = keep_to_path(rallies.camera[b, RING:], rallies.clock[b] + 1, state, pos, vel)
         film(rallies, b, pos, vel, state)
         if outcome != 0:
             break

@@ -17,7 +17,7 @@ from common.physics import touch
 from common.physics.constants import GRID_STEP
 from common.physics.fly import NO_ROBOT, fly_step
 from common.rally.launch import LAUNCH_SIZE, LONGEST_FLIGHT
-from common.rally.play import PATH_BOUNCE, PATH_ROWS, keep_to_path
+from common.rally.play import NO_SAMPLE, SAMPLE, keep_to_path
 from common.rally.trajectory import State
 from common.real2sim.predict import predict, touch_down
 from common.real2sim.replay import Flags, RecordedRallies
@@ -50,7 +50,7 @@ def _smoothed(times: Array, residuals: Array, at: Array) -> tuple[Array, Array]:
 
 
 def path_of(track: Track, fitted: "Fit") -> Array:
-    """Return the path (1 + n, 6) of a track's ball, as ``play.Rallies.driven``.
+    """Return the path (n, 7) of a track's ball, as ``play.keep_to_path``.
 
     It ends with the last sample that the fit used: from there on physics goes on.
     """
@@ -58,7 +58,6 @@ def path_of(track: Track, fitted: "Fit") -> Array:
     table = fitted.table if fitted.bounced else _NO_TABLE
     flight = fitted.options.flight
     grid = GRID_STEP * np.arange(math.floor(times[-1] / GRID_STEP + 1e-9) + 1, dtype=np.float64)
-    path = np.zeros((1 + len(grid), 6))
     pos, vel = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     predict(fitted.launch, table, flight, grid, pos, vel)
     at_samples = np.empty_like(positions)
@@ -75,10 +74,7 @@ def path_of(track: Track, fitted: "Fit") -> Array:
         shift, slope = _smoothed(times[samples], residuals[samples], grid[rows])
         pos[rows] += shift
         vel[rows] += slope
-    path[1:, :3], path[1:, 3:] = pos, vel
-    path[0, PATH_ROWS] = len(grid)
-    path[0, PATH_BOUNCE] = np.searchsorted(grid, bounce)
-    return path
+    return np.column_stack((pos, vel, grid >= bounce))
 
 
 @kernel
@@ -87,7 +83,7 @@ def first_touch(launch: Array, path: Array, model: int, no_robot: Array) -> int:
 
     Args:
         launch: Position, velocity, spin, drag and lift factor (11,).
-        path: As ``play.Rallies.driven`` (1 + n, 6).
+        path: As ``play.keep_to_path`` (n, 7).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
         no_robot: ``fly.NO_ROBOT``.
     """
@@ -116,13 +112,13 @@ def driven(rallies: RecordedRallies, tracks: Sequence[Track], fits: Sequence["Fi
         fits: Their fits.
     """
     each = [path_of(track, fitted) for track, fitted in zip(tracks, fits, strict=True)]
-    paths = np.zeros((len(each), max((len(path) for path in each), default=1), 6))
+    paths = np.full((len(each), max(len(path) for path in each), SAMPLE), NO_SAMPLE)
     launches = np.empty((len(each), LAUNCH_SIZE))
     valid: Flags = np.zeros(len(each), np.bool_)
     for k, (path, fitted) in enumerate(zip(each, fits, strict=True)):
         paths[k, : len(path)] = path
         launches[k] = rallies.launches[k]
-        launches[k, :6] = path[1]
+        launches[k, :6] = path[0, :6]
         what = first_touch(launches[k], paths[k], fitted.options.flight, NO_ROBOT)
         valid[k] = what == touch.ROBOT_COURT
     return replace(rallies, launches=launches, paths=paths, valid=valid)

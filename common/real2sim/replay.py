@@ -49,7 +49,7 @@ class RecordedRallies:
         launches: (n, 11) position, velocity, spin, drag factor, lift factor.
         seeds: (n,) what the rest of each rally is drawn from.
         valid: (n,) whether it crosses the net untouched and touches the robot's court first.
-        paths: (n, 1 + m, 6) that the balls keep to until they are hit, as ``play.Rallies.driven``; None: they
+        paths: (n, m, 7) that the balls keep to until they are hit, as ``play.keep_to_path``; None: they
             fly as physics has it.
     """
 

@@ -11,6 +11,7 @@ from common.physics.flight import FULL, SIMPLE
 from common.policy.weights import Policy
 from common.rally.launch import Purpose, RallyBlock, draw_rallies
 from common.rally.noise import Condition
+from common.rally.play import NO_SAMPLE
 from common.rally.undisturbed import undisturbed
 from services.evaluator.measures import Played
 
@@ -39,8 +40,8 @@ class FixedRallies:
         self._dealt += fresh
         self._filled += count - fresh
         paths = None
-        if self._rallies.paths is not None:  # filler flies freely: its paths have no rows
-            paths = np.zeros((count, *self._rallies.paths.shape[1:]))
+        if self._rallies.paths is not None:  # filler flies freely: its paths end before they begin
+            paths = np.full((count, *self._rallies.paths.shape[1:]), NO_SAMPLE)
             paths[:fresh] = self._rallies.paths[rows]
         return Launches(
             np.concatenate((self._rallies.launches[rows], self._filler.launches[extra])),

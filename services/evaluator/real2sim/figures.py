@@ -80,7 +80,7 @@ def _hall(space: Any, rally: RecordedRally) -> None:
     space.set_proj_type("ortho")
     space.set_xlabel("x [m]", labelpad=8)
     space.set_ylabel("y [m]", labelpad=2)
-    space.set_zlabel("z [m]", labelpad=-8)
+    space.set_zlabel("z [m]", labelpad=-3)
     space.tick_params(labelsize=7.5, pad=0)
     space.set_xticks([-1, 0, 1])
     space.set_yticks([-0.5, 0, 0.5])

@@ -1,18 +1,21 @@
 """`real2sim`: recordings of every format through the whole command, with a policy of its own."""
 
 import json
+import sys
 from threading import Event
 
 import numpy as np
 import pytest
 
 from common.config import ConfigError, load
+from common.errors import ReportedError
 from common.policy.weights import save_policy
 from common.process import DONE
 from common.rally.launch import draw_rallies
 from common.real2sim.deepmind import COLUMNS
 from common.real2sim.replay import seed_of
 from common.real2sim.tracks import RecordingError
+from services.evaluator import real2sim
 from services.evaluator.once import StoppedError
 from services.evaluator.real2sim import command
 from services.evaluator.real2sim.config import Real2SimConfig
@@ -248,6 +251,15 @@ def test_a_film_is_made_where_it_is_asked_for():
     assert str(command.video_of(settings(out="o"))) == "o/rallies.mp4"
     assert str(command.video_of(settings(out="o", video="v.mp4"))) == "v.mp4"
     assert command.video_of(settings(out="o", film_rallies=0)) is None
+
+
+def test_without_its_libraries_a_report_names_the_extra(policy, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "services.evaluator.real2sim.page", None)
+    monkeypatch.delattr(real2sim, "page", raising=False)
+    flags = ["--data", str(tmp_path / "gone.json"), "--policy", policy, "--out", str(tmp_path / "o")]
+
+    with pytest.raises(ReportedError, match=r"pip install 'topspin\[report\]'"):
+        command.main(flags, Event())  # said before the recordings are looked at
 
 
 def test_it_stops_when_it_is_asked_to(policy, tmp_path):

@@ -9,7 +9,7 @@ from common.physics.constants import GRID_STEP
 from common.physics.flight import SIMPLE
 from common.physics.fly import NO_ROBOT
 from common.rally.launch import RallyBlock, draw_rallies
-from common.rally.play import PATH_BOUNCE, PATH_ROWS, keep_to_path
+from common.rally.play import NO_SAMPLE, SAMPLE, keep_to_path
 from common.rally.trajectory import State
 from common.real2sim.identify import fit
 from common.real2sim.kinematic import driven, first_touch, path_of
@@ -24,14 +24,10 @@ LAUNCH = launch_of(spin=(3.0, -45.0, 5.0))
 
 
 def own_paths(rallies):
-    """Return the paths (n, 1 + m, 6) of rallies as they were played, their bounce marked."""
-    longest = max(len(rally.time) for rally in rallies)
-    paths = np.zeros((len(rallies), 1 + longest, 6))
+    """Return the paths (n, m, 7) of rallies as they were played."""
+    paths = np.full((len(rallies), max(len(rally.time) for rally in rallies), SAMPLE), NO_SAMPLE)
     for path, rally in zip(paths, rallies, strict=True):
-        n = len(rally.time)
-        path[0, PATH_ROWS] = n
-        path[0, PATH_BOUNCE] = np.flatnonzero(np.append(rally.state, 1) > 0)[0]
-        path[1 : 1 + n] = np.hstack([rally.ball_pos, rally.ball_vel])
+        path[: len(rally.time)] = np.column_stack([rally.ball_pos, rally.ball_vel, rally.state])
     return paths
 
 
@@ -50,19 +46,19 @@ def test_a_rally_driven_by_its_own_path_is_the_same_rally_bit_for_bit():
 def test_a_driven_ball_goes_where_the_recording_went_and_not_where_physics_would():
     block = draw_rallies(3, seed=3)
     paths = own_paths(record(wave, block, CONFIG))
-    paths[:, 1:, 1] += 0.02  # the whole recording, 20 mm to the left
-    bounced = [int(path[0, PATH_BOUNCE]) for path in paths]
+    paths[:, :, 1] += 0.02  # the whole recording, 20 mm to the left
+    bounced = [int(np.flatnonzero(path[:, 6] != 0)[0]) for path in paths]
     moved = record(wave, RallyBlock(block.launches, block.seeds, 3, paths), CONFIG)
 
     for rally, path, step in zip(moved, paths, bounced, strict=True):
-        np.testing.assert_array_equal(rally.ball_pos[1 : step - 1], path[2:step, :3])
+        np.testing.assert_array_equal(rally.ball_pos[1 : step - 1], path[1 : step - 1, :3])
 
 
 def test_a_ball_without_a_path_flies_freely_among_driven_ones():
     block = draw_rallies(2, seed=3)
     free = record(wave, block, CONFIG)
     paths = own_paths(free)
-    paths[0] = 0.0
+    paths[0] = NO_SAMPLE
     again = record(wave, RallyBlock(block.launches, block.seeds, 2, paths), CONFIG)
 
     for one, other in zip(free, again, strict=True):
@@ -79,11 +75,12 @@ def test_a_ball_without_a_path_flies_freely_among_driven_ones():
         (State.TAU_2, 6, False),  # hit
         (State.TAU_23, 6, False),
         (State.TAU_12, 7, False),  # the recording is over
+        (State.TAU_12, 9, False),
     ],
 )
 def test_a_path_counts_until_the_hit_and_while_it_agrees_on_the_bounce(state, step, kept):
-    path = np.full((8, 6), 0.5)
-    path[0, PATH_ROWS], path[0, PATH_BOUNCE] = 7, 5
+    path = np.full((9, SAMPLE), 0.5)
+    path[:, 6] = [0, 0, 0, 0, 0, 1, 1, NO_SAMPLE, NO_SAMPLE]
     pos, vel = keep_to_path(path, step, int(state), (0.0, 0.0, 0.1), (-5.0, 0.0, 0.0))
 
     assert (pos == (0.5, 0.5, 0.5)) == (vel == (0.5, 0.5, 0.5)) == kept
@@ -92,15 +89,15 @@ def test_a_path_counts_until_the_hit_and_while_it_agrees_on_the_bounce(state, st
 def test_a_noisy_track_gives_a_path_nearer_to_the_ball_than_its_samples():
     track = seen(LAUNCH, noise=2e-3)
     path = path_of(track, fit(track))
-    n = int(path[0, PATH_ROWS])
+    n, bounce = len(path), int(np.flatnonzero(path[:, 6])[0])
     truth, velocities = np.empty((n, 3)), np.empty((n, 3))
     predict(LAUNCH, TABLE, SIMPLE, GRID_STEP * np.arange(n), truth, velocities)
-    off = np.abs(np.arange(n) - path[0, PATH_BOUNCE]) > 1  # in the bounce's own step two balls are apart
+    off = np.abs(np.arange(n) - bounce) > 1  # in the bounce's own step two balls are apart
 
     assert n == int(track.times[-1] / GRID_STEP + 1e-9) + 1
-    assert path[0, PATH_BOUNCE] == np.ceil(touch_down(LAUNCH, SIMPLE, 1.0)[0] / GRID_STEP)
-    assert np.sqrt(np.mean((path[1 : 1 + n, :3] - truth) ** 2)) < 1e-3
-    assert np.sqrt(np.mean((path[1 : 1 + n, 3:] - velocities)[off] ** 2)) < 0.06
+    assert bounce == np.ceil(touch_down(LAUNCH, SIMPLE, 1.0)[0] / GRID_STEP)
+    assert np.sqrt(np.mean((path[:, :3] - truth) ** 2)) < 1e-3
+    assert np.sqrt(np.mean((path[:, 3:6] - velocities)[off] ** 2)) < 0.06
 
 
 def test_a_path_follows_a_recording_that_no_model_explains():
@@ -108,7 +105,7 @@ def test_a_path_follows_a_recording_that_no_model_explains():
     bent = track.positions + 0.03 * np.sin(9.0 * track.times)[:, None] ** 2 * np.array([0.0, 1.0, 0.0])
     fitted = fit(type(track)("bent", track.times, bent))
     path = path_of(type(track)("bent", track.times, bent), fitted)
-    at = np.interp(track.times, GRID_STEP * np.arange(int(path[0, PATH_ROWS])), path[1:, 1])
+    at = np.interp(track.times, GRID_STEP * np.arange(len(path)), path[:, 1])
 
     assert fitted.rms > 3e-3
     assert np.sqrt(np.mean((at - bent[:, 1]) ** 2)) < 0.5 * fitted.rms
@@ -122,7 +119,7 @@ def test_one_wrong_sample_does_not_bend_the_path():
 
     straight, bent = path_of(track, fitted), path_of(type(track)("wrong", track.times, wrong), fitted)
 
-    assert np.abs(straight - bent)[1:, :3].max() < 1e-3
+    assert np.abs(straight - bent)[:, :3].max() < 1e-3
 
 
 def test_a_driven_rallys_validity_is_its_paths():
@@ -132,19 +129,17 @@ def test_a_driven_rallys_validity_is_its_paths():
 
     assert found.valid.tolist() == [True, False]  # the second flies over the table
     assert found.block().path_rows == found.paths.shape[1]
-    np.testing.assert_array_equal(found.launches[:, :6], found.paths[:, 1])
+    np.testing.assert_array_equal(found.launches[:, :6], found.paths[:, 0, :6])
     np.testing.assert_array_equal(found.launches[:, 6:], [fitted.launch[6:] for fitted in fits])
 
 
 def test_what_a_driven_ball_touches_first_is_its_paths():
     grid = GRID_STEP * np.arange(100)
-    path = np.zeros((101, 6))
-    path[0, PATH_ROWS] = path[0, PATH_BOUNCE] = 100
     low, pos, vel = launch_of(vel=(-5.0, 0.0, 0.9)), np.empty((100, 3)), np.empty((100, 3))
     predict(low, np.empty(0), SIMPLE, grid, pos, vel)
-    path[1:] = np.hstack([pos, vel])
+    path = np.column_stack([pos, vel, np.zeros(100)])
 
-    assert first_touch(LAUNCH, np.zeros((1, 6)), SIMPLE, NO_ROBOT) == touch.ROBOT_COURT
+    assert first_touch(LAUNCH, np.zeros((0, SAMPLE)), SIMPLE, NO_ROBOT) == touch.ROBOT_COURT
     assert first_touch(LAUNCH, path, SIMPLE, NO_ROBOT) == touch.NET
 
 
@@ -153,4 +148,4 @@ def test_a_path_asks_for_our_collisions():
     original = CONFIG.model_copy(update={"collision": "original"})
 
     with pytest.raises(ValueError, match="a path under collision 'original': allowed is 'tailored'"):
-        record(wave, RallyBlock(block.launches, block.seeds, 1, np.zeros((1, 5, 6))), original)
+        record(wave, RallyBlock(block.launches, block.seeds, 1, np.zeros((1, 5, SAMPLE))), original)
