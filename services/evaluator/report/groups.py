@@ -38,6 +38,9 @@ def leaves(settings: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str,
             yield f"{parent}{name}", value
 
 
+SPINS: Final[Mapping[str, list[str]]] = {"hidden": [], "estimated": ["estimated spin"], "true": ["true spin"]}
+
+
 def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a run that make the experiment, by dotted path."""
     return {
@@ -59,7 +62,8 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     stages = STAGES.get(first, f"from stage {first}")
     collision = f"{env.get('collision', 'tailored')} collisions"
     more = [f"history {seen['history']}"] if seen.get("history", 0) else []
-    more += ["true spin"] if seen.get("spin", False) else []
+    more += SPINS[seen.get("spin", "hidden")]
+    more += ["sample age"] if seen.get("age", False) else []
     critic = seen.get("critic", "policy")
     return (
         (stages, stages),

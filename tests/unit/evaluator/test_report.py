@@ -143,7 +143,8 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("a", env=privileged),
             make_run("b", env=privileged, curriculum={"first_stage": 3}),
             make_run("c", env=privileged | {"collision": "original"}),
-            make_run("d", env={"observation": {"critic": "policy", "history": 8, "spin": True}}),
+            make_run("d", env={"observation": {"critic": "policy", "history": 8, "spin": "true"}}),
+            make_run("e", env={"observation": {"critic": "policy", "spin": "estimated", "age": True}}),
         ]
     )
 
@@ -152,6 +153,7 @@ def test_groups_are_called_by_what_tells_them_apart():
         "stage 3 only",
         "stages 1+2+3, original collisions",
         "stages 1+2+3, history 8 + true spin, critic sees no more",
+        "stages 1+2+3, estimated spin + sample age, critic sees no more",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"
