@@ -1,37 +1,31 @@
 """`python -m services.evaluator play`: measure a policy on fixed rallies, and film the first of them."""
 
-import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 from typing import Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from common.config import load
 from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
-from common.policy.weights import Policy, load_policy
+from common.policy.weights import load_policy
 from common.process import DONE
-from common.rally.launch import RallyBlock
-from common.render.film import FilmOptions, check_tools, picture_count, pictures, write_film
-from common.render.gl import Image
+from common.render.film import check_tools
 from common.render.rally_recorder import record
 from common.run_folder import LATEST, RunFolder
 from services.evaluator import once
+from services.evaluator.filming import FilmConfig, film
 from services.evaluator.match import evaluation_rallies
-
-log = logging.getLogger(__name__)
 
 PROG: Final = "python -m services.evaluator play"
 SHIPPED_POLICY: Final = Path("assets/policies/default")
 
 
-class PlayConfig(BaseModel):
+class PlayConfig(FilmConfig):
     """Measure a policy on fixed rallies and film the first of them."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     policy: str = Field(
         "", description=f"policy folder; empty: {SHIPPED_POLICY} if it is there, else the latest run's best"
@@ -44,21 +38,6 @@ class PlayConfig(BaseModel):
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
     envs: int = Field(250, ge=1, le=65536, description="environments played together")
-    camera: Literal["side", "behind", "target", "follow"] = Field(
-        "side", description="where the film is taken from; follow goes with the ball"
-    )
-    slow: float = Field(
-        1.0, ge=0.05, le=1, description="speed of the film; 0.25 is four times slower than real time"
-    )
-    width: int = Field(
-        1280, ge=320, le=3840, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
-    )
-    height: int = Field(
-        720, ge=180, le=2160, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
-    )
-    rate_hz: float = Field(
-        50.0, ge=10, le=100, description="pictures a second", json_schema_extra={"unit": "Hz"}
-    )
     json_line: bool = Field(
         False, alias="json", description="print the measures as one JSON object, last line"
     )
@@ -88,7 +67,9 @@ def main(argv: Sequence[str], stop: Event) -> int:
         rallies = evaluation_rallies(
             config.film_rallies, config.launch, config.noise, config.seed, env.flight
         )
-        film(policy, rallies, env, config, breathe)
+        note = f"{config.launch} balls, noise {config.noise}"
+        # once more, from home: a match keeps no flights
+        film(Path(config.video), record(policy.act, rallies, env), config, note, breathe)
     found["seconds"] = round(time.monotonic() - started, 2)
     once.print_measures(found, config.json_line)
     return DONE
@@ -99,27 +80,3 @@ def policy_folder(given: str) -> Path:
     if given:
         return Path(given)
     return SHIPPED_POLICY if SHIPPED_POLICY.exists() else RunFolder.of(LATEST).best_policy
-
-
-def film(
-    policy: Policy, rallies: RallyBlock, env: EnvConfig, config: PlayConfig, breathe: Callable[[], None]
-) -> None:
-    """Play ``rallies`` once more, from home, and write the film; ``breathe`` is called between pictures."""
-    options = FilmOptions(
-        config.width,
-        config.height,
-        config.rate_hz,
-        config.slow,
-        config.camera,
-        note=f"{config.launch} balls, noise {config.noise}",
-    )
-    recorded = record(policy.act, rallies, env)
-    total = picture_count(recorded, options)
-    log.info("filming rallies=%d pictures=%d file=%s", len(recorded), total, config.video)
-
-    def watched() -> Iterator[Image]:
-        for picture in pictures(recorded, options):
-            breathe()
-            yield picture
-
-    write_film(Path(config.video), watched(), config.width, config.height, config.rate_hz)

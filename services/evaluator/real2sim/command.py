@@ -4,7 +4,7 @@ import json
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 from types import ModuleType
@@ -18,11 +18,11 @@ from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE
-from common.render.film import FilmOptions, check_tools, pictures, write_film
-from common.render.gl import Image
+from common.render.film import check_tools
 from common.render.rally_recorder import RecordedRally, record
 from services.evaluator import once
 from services.evaluator.breakdown import breakdown, table
+from services.evaluator.filming import film
 from services.evaluator.match import play_match
 from services.evaluator.measures import Played, measures
 from services.evaluator.play import policy_folder
@@ -68,7 +68,8 @@ def main(argv: Sequence[str], stop: Event) -> int:
         again = dict(zip(rows, record(policy.act, block.of(np.array(rows)), env), strict=True))
     if video is not None:
         found["video"] = str(video)
-        film(video, [again[k] for k in filmed.tolist()], config, breathe)
+        note = f"recorded balls, noise {config.noise}, perception {config.perception}"
+        film(video, [again[k] for k in filmed.tolist()], config, note, breathe)
     found["seconds"] = round(time.monotonic() - started, 2)
     if page is not None:
         found["report"] = str(Path(config.out) / "report.md")
@@ -119,28 +120,6 @@ def print_found(found: dict[str, Any], as_json: bool) -> None:
         if not name.startswith("by_"):
             sys.stdout.write(f"{name:>24}  {value}\n")
     sys.stdout.write("\n".join(table(by)) + "\n")
-
-
-def film(
-    path: Path, rallies: Sequence[RecordedRally], config: Real2SimConfig, breathe: Callable[[], None]
-) -> None:
-    """Write the film of ``rallies``; ``breathe`` is called between pictures."""
-    options = FilmOptions(
-        config.width,
-        config.height,
-        config.rate_hz,
-        config.slow,
-        config.camera,
-        note=f"recorded balls, noise {config.noise}, perception {config.perception}",
-    )
-    log.info("filming rallies=%d file=%s", len(rallies), path)
-
-    def watched() -> Iterator[Image]:
-        for picture in pictures(rallies, options):
-            breathe()
-            yield picture
-
-    write_film(path, watched(), config.width, config.height, config.rate_hz)
 
 
 def _page() -> ModuleType:

@@ -2,18 +2,18 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from services.evaluator.filming import FilmConfig
 
 
-class Real2SimConfig(BaseModel):
+class Real2SimConfig(FilmConfig):
     """Play recordings of real balls with a policy, which sees them through a simulated camera and an estimator.
 
     Recordings are states just after a stroke (DeepMind's JSON, CSV) or tracks (HDF5 of a ball gun, CSV), which are
     fitted first; docs/real2sim.md has formats and frames. Played is whatever flies towards the robot, crosses the net
     and touches its court first (valid_share); the rates are over these.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
 
     data: str = Field("", description="recordings: a .json, .hdf5, .csv file, or a folder of them")
     policy: str = Field(
@@ -49,20 +49,8 @@ class Real2SimConfig(BaseModel):
         description="film to write, H.264; empty: rallies.mp4 in --out, if that is given",
     )
     film_rallies: int = Field(6, ge=0, le=200, description="rallies to film; 0: no film")
-    camera: Literal["side", "behind", "target", "follow"] = Field(
-        "side", description="where the film is taken from; follow goes with the ball"
-    )
     slow: float = Field(
         0.5, ge=0.05, le=1, description="speed of the film; 0.5 is twice slower than real time"
-    )
-    width: int = Field(
-        1280, ge=320, le=3840, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
-    )
-    height: int = Field(
-        720, ge=180, le=2160, multiple_of=2, description="of the film", json_schema_extra={"unit": "pixels"}
-    )
-    rate_hz: float = Field(
-        50.0, ge=10, le=100, description="pictures a second", json_schema_extra={"unit": "Hz"}
     )
     json_line: bool = Field(
         False, alias="json", description="print the measures as one JSON object, last line"
