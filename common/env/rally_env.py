@@ -196,7 +196,7 @@ class RallyEnv:
             count,
             config.observation.history,
             full=config.perception == "full",
-            tracked=config.observation.spin == "estimated",
+            tracked=config.observation.spin == "estimated" or config.observation.prediction,
             reviewed=self._review is not None,
             path_rows=path_rows,
         )
@@ -320,6 +320,7 @@ class RallyEnv:
             robot.joint_pos,
             robot.joint_vel,
             _TOLD[options.spin],
+            options.prediction,
             options.age,
             is_privileged,
             self._obs,

@@ -46,10 +46,19 @@ SPIN_ESTIMATE: tuple[Part, ...] = (
         "rad/s",
         -1500.0,
         1500.0,
-        "the ball's spin as its flight before the bounce tells it",
+        "the ball's spin behind the bounce, as its flight so far tells it",
     ),
 )
 """Option ``spin: estimated``: what a robot can find out by itself."""
+
+PREDICTION: tuple[Part, ...] = (
+    Part("present_ball_pos", 3, "m", -4.0, 4.0, "where the ball is now, as its flight so far tells"),
+    Part("present_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity now"),
+    Part("meeting_in", 1, "s", -2.5, 1.2, "time until 0.12 s behind the bounce, about when it will be met"),
+    Part("meeting_ball_pos", 3, "m", -8.0, 4.0, "where the ball will be then"),
+    Part("meeting_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity then"),
+)
+"""Option ``prediction``: all samples since the launch taken together (``prediction.py``), latency made up for."""
 
 AGE: tuple[Part, ...] = (Part("sample_age", 1, "s", 0.0, 2.5, "how long ago the ball was where it is seen"),)
 """Option ``age``: latency and lost samples are known to whoever stamps his samples."""
@@ -102,12 +111,17 @@ class ObservationConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     history: int = Field(
-        4, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
+        0, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
     )
     spin: Literal["hidden", "estimated", "true"] = Field(
         "estimated",
-        description="the ball's spin as the policy is told it: not at all, as its flight tells (spin_estimate.py), or "
+        description="the ball's spin as the policy is told it: not at all, as its flight tells (prediction.py), or "
         "the truth: a ceiling, nothing for a robot",
+    )
+    prediction: bool = Field(
+        True,
+        description="tell the policy where the ball is now and how it will come to be met, from all its samples "
+        "(prediction.py)",
     )
     age: bool = Field(
         True, description="tell the policy how old its ball sample is: samples carry a time stamp"
@@ -118,7 +132,7 @@ class ObservationConfig(BaseModel):
     )
 
 
-PAPER_OBSERVATION = ObservationConfig(history=0, spin="hidden", age=False, critic="policy")
+PAPER_OBSERVATION = ObservationConfig(history=0, spin="hidden", prediction=False, age=False, critic="policy")
 """The paper's: 37 numbers for policy and critic alike."""
 
 
@@ -128,7 +142,9 @@ def policy_layout(config: ObservationConfig) -> tuple[Part, ...]:
         part._replace(name=f"{part.name}_{k}") for k in range(1, config.history + 1) for part in EARLIER
     )
     spin = {"hidden": (), "estimated": SPIN_ESTIMATE, "true": SPIN}[config.spin]
-    return OBSERVATION + spin + (AGE if config.age else ()) + earlier
+    return (
+        OBSERVATION + spin + (PREDICTION if config.prediction else ()) + (AGE if config.age else ()) + earlier
+    )
 
 
 def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
@@ -152,6 +168,7 @@ def markdown() -> str:
         ("Observation", OBSERVATION),
         ("Option spin estimated, after it", SPIN_ESTIMATE),
         ("Option spin true, in its place", SPIN),
+        ("Option prediction, after that", PREDICTION),
         ("Option age, after that", AGE),
         ("Option history, after that, each", EARLIER),
         ("What the critic alone sees, last", PRIVILEGED),

@@ -31,7 +31,7 @@ from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_s
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
-from common.rally.spin_estimate import BOUNCED, SPIN, TRACK, begin_track, follow, turn_at_bounce
+from common.rally.prediction import PRESENT, SPIN, TRACK, begin_track, follow, predict
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
 Array = npt.NDArray[np.float64]
@@ -77,7 +77,7 @@ class Rallies(NamedTuple):
     # (B, FILM + ESTIMATE) the simulated camera's film and what the estimator makes of it; no rows: perception is cheap.
     # One array, not several: with four, every step of every rally took twice as long, camera or not
     eyes: Array
-    track: Array  # (B, TRACK) what the samples tell of the spin; no rows: nobody asks
+    track: Array  # (B, TRACK) what the samples tell of the flight; no rows: nobody asks
     hit: Array  # (B, HIT) ball and joints at the last legal contact; no rows: nobody asks
     last_action: Array  # (B, 7)
 
@@ -147,7 +147,7 @@ def allocate(
         count: B.
         history: How many earlier samples are remembered.
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
-        tracked: Whether spin is estimated.
+        tracked: Whether the flight is followed: spin estimated, the meeting predicted.
         reviewed: Whether contacts are kept, for ``hindsight``.
         path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """
@@ -244,19 +244,22 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
         for j in range(6):
             earlier[k, j] = earlier[k - 1, j] if k > 0 else rallies.seen[b, j]
     seen = rallies.seen[b]
-    last = (seen[3], seen[4], seen[5])
     if rallies.eyes.shape[0] > 0:
         _estimate(rallies, b, noise)
     else:
         _sample(rallies, b, step, noise)
     if rallies.track.shape[0] > 0:
-        track = rallies.track[b]
+        track, now = rallies.track[b], rallies.clock[b] * GRID_STEP
         if step == 0:
             begin_track(track, seen, noise.position_noise, noise.velocity_noise)
-        elif seen[6] == 0.0:
-            follow(track, seen, seen[_TAKEN], noise.position_noise, noise.velocity_noise)
-        elif seen[6] == 1.0 and track[BOUNCED] == 0.0:
-            turn_at_bounce(track, last)
+            predict(track, now)
+        elif seen[6] <= 1.0:
+            bounced = seen[6] == 1.0
+            follow(track, seen, seen[_TAKEN], bounced, noise.position_noise, noise.velocity_noise)
+            predict(track, now)
+        else:  # it was hit: what was followed is over
+            for k in range(6):
+                track[PRESENT + k] = seen[k]
 
 
 @kernel
@@ -640,6 +643,7 @@ def observe(
     joint_pos: Array,
     joint_vel: Array,
     spin: int,
+    predicted: bool,
     age: bool,
     privileged: bool,
     out: npt.NDArray[np.float32],
@@ -652,6 +656,7 @@ def observe(
         joint_pos: Joint positions now (B, 7).
         joint_vel: Joint velocities now (B, 7).
         spin: Which the policy is told: ``SPIN_HIDDEN``, ``SPIN_ESTIMATED`` or ``SPIN_TRUE``.
+        predicted: Whether it is told where the ball is now and how it will come to be met.
         age: Whether it is told how old its sample is.
         privileged: Whether the critic's truth follows.
         out: Rows to write.
@@ -682,6 +687,10 @@ def observe(
             for j in range(3):
                 o[at + j] = rallies.ball[b, 6 + j] if spin == SPIN_TRUE else rallies.track[b, SPIN + j]
             at += 3
+        if predicted:
+            for j in range(13):
+                o[at + j] = rallies.track[b, PRESENT + j]
+            at += 13
         if age:
             o[at] = rallies.clock[b] * GRID_STEP - rallies.seen[b, _TAKEN]
             at += 1

@@ -23,7 +23,7 @@ from common.rally.observation import (
     policy_layout,
     size,
 )
-from common.rally.spin_estimate import SPIN
+from common.rally.prediction import MEETING, PRESENT, SPIN
 from common.rally.trajectory import State
 from tests.unit.rally.scripted import HOME, begin, make_motion, make_record, make_rules
 
@@ -38,7 +38,15 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
     play.play_step(rallies, make_motion(start, joints), np.zeros((1, 7)), make_rules(), PROFILES["off"], step)
     out = np.empty((1, 37), np.float32)
     play.observe(
-        rallies, np.array([0]), np.array([joints]), np.array([rates]), play.SPIN_HIDDEN, False, False, out
+        rallies,
+        np.array([0]),
+        np.array([joints]),
+        np.array([rates]),
+        spin=play.SPIN_HIDDEN,
+        predicted=False,
+        age=False,
+        privileged=False,
+        out=out,
     )
     return out[0]
 
@@ -129,13 +137,14 @@ def test_the_documented_layout_is_the_real_one():
 @pytest.mark.parametrize("history", [0, 1, 5])
 @pytest.mark.parametrize("spin", ["hidden", "estimated", "true"])
 @pytest.mark.parametrize("age", [False, True])
+@pytest.mark.parametrize("prediction", [False, True])
 @pytest.mark.parametrize("critic", ["policy", "privileged"])
-def test_options_only_add_numbers_behind_the_papers(history, spin, age, critic):
-    config = ObservationConfig(history=history, spin=spin, age=age, critic=critic)
+def test_options_only_add_numbers_behind_the_papers(history, spin, prediction, age, critic):
+    config = ObservationConfig(history=history, spin=spin, prediction=prediction, age=age, critic=critic)
 
     assert policy_layout(config)[: len(OBSERVATION)] == OBSERVATION
     assert critic_layout(config)[: len(policy_layout(config))] == policy_layout(config)
-    assert size(policy_layout(config)) == 37 + 3 * (spin != "hidden") + age + 6 * history
+    assert size(policy_layout(config)) == 37 + 3 * (spin != "hidden") + 13 * prediction + age + 6 * history
     assert size(critic_layout(config)) - size(policy_layout(config)) == size(PRIVILEGED) * (
         critic == "privileged"
     )
@@ -152,7 +161,9 @@ def played(config, steps=12, noise="standard"):
 
 
 def test_the_memory_holds_what_was_seen_before_newest_first():
-    observations, _ = played(ObservationConfig(history=3, spin="hidden", age=False, critic="policy"))
+    observations, _ = played(
+        ObservationConfig(history=3, spin="hidden", prediction=False, age=False, critic="policy")
+    )
     seen = observations[:, 24:30]
 
     for age in (1, 2, 3):
@@ -161,7 +172,7 @@ def test_the_memory_holds_what_was_seen_before_newest_first():
         np.testing.assert_array_equal(earlier[0], seen[0])  # before the launch there was nothing else to see
 
 
-def test_the_spin_as_estimated_and_the_samples_age_stand_behind_the_papers_numbers():
+def test_the_spin_as_estimated_the_prediction_and_the_samples_age_stand_behind_the_papers_numbers():
     env = RallyEnv(3, EnvConfig(), LocalRallies(seed=3, noise="standard"))
     env.reset()
     at = offsets(policy_layout(EnvConfig().observation))
@@ -175,6 +186,17 @@ def test_the_spin_as_estimated_and_the_samples_age_stand_behind_the_papers_numbe
         np.testing.assert_array_equal(
             obs[:, at["spin_estimate"]], rallies.track[:, SPIN : SPIN + 3].astype(np.float32)
         )
+        for name, where in (
+            ("present_ball_pos", PRESENT),
+            ("present_ball_vel", PRESENT + 3),
+            ("meeting_in", MEETING),
+            ("meeting_ball_pos", MEETING + 1),
+            ("meeting_ball_vel", MEETING + 4),
+        ):
+            part = obs[:, at[name]]
+            np.testing.assert_array_equal(
+                part, rallies.track[:, where : where + part.shape[1]].astype(np.float32)
+            )
         np.testing.assert_array_equal(ages[-1], age.astype(np.float32))
 
     assert np.abs(obs[:, at["spin_estimate"]]).max() > 1.0
@@ -183,7 +205,7 @@ def test_the_spin_as_estimated_and_the_samples_age_stand_behind_the_papers_numbe
 
 def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():
     paper, _ = played(PAPER_OBSERVATION)
-    all_, truth = played(ObservationConfig(history=0, spin="true", age=False))
+    all_, truth = played(ObservationConfig(history=0, spin="true", prediction=False, age=False))
 
     np.testing.assert_array_equal(all_[:, :37], paper)
     np.testing.assert_allclose(all_[:, 37:40], truth[:, 6:9], rtol=1e-6)  # option spin

@@ -1,0 +1,340 @@
+"""What a ball's flight tells: where it is now, how it spins, and how it will come to be met.
+
+Least squares over the samples seen since launch, and anew since the bounce. Against a nominal ball that sets out from
+the first sample with nominal air and spin w_0, a sample at time t lies off by (lift below its saturation,
+``physics.flight``; drag brakes what is off as well, as if it were linear)
+
+    dp(t) = dp_0 + dv_0 E(t) + K dw x X(t) + k D(t)          K = (rho A/2m) 1.067 r
+    dv(t) =        dv_0 E'(t) + K dw x X'(t) + k D'(t)
+
+with X' the nominal ball's way, D' what its drag has taken off it, E' the share of a disturbance that is left: linear in
+what isn't known (first position and velocity, spin, drag's share k), so the normal equations are summed sample by
+sample. Gaussian priors say how large each may be; what doesn't show, spin along the flight, keeps its prior.
+
+At the bounce what is known is taken through the table's law: ten points of equal weight stand for spin, restitution and
+friction as uncertain as they are (cubature; Arasaratnam, Haykin 2009), and the mean and covariance of what becomes of
+them are the prior of the fit that begins there. So a velocity that the bounce wasn't expected to lead to tells of the
+spin: after a rolling one all that lies in the table's plane, after a sliding one its direction.
+
+The prediction is the nominal flight from there on, through an average table's bounce, to ``MEETING_AFTER`` behind it.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from common.jit import kernel
+from common.physics.constants import AIR_FACTOR, BALL_RADIUS
+from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_SLOPE, flight_step
+from common.physics.table_bounce import table_bounce
+from common.physics.vec import Vec, norm, scale
+from common.rally.cholesky import factor, inverse, substitute
+
+Array = npt.NDArray[np.float64]
+
+UNKNOWNS = 10  # dp_0 (3), dv_0 (3), dw / SPIN_SIGMA (3), k / DRAG_SIGMA
+_DV, _SPIN, _DRAG = 3, 6, 9
+
+# Columns of a track's row
+POS, VEL = 0, 3  # of the nominal ball at the last sample
+NOMINAL_SPIN, NOMINAL_DRAG = 6, 9  # w_0 [rad/s], drag factor
+MOMENT, BEGUN = 10, 11  # of the last sample, and of the fit's beginning, since launch [s]
+WAY, PATH = 12, 15  # X' [m], X [m s]
+SLOWED, SLOWED_PATH = 18, 21  # D' [m/s], D [m]
+LEFT, LEFT_PATH = 24, 25  # E' [-], E [s]
+BOUNCED = 26  # 1: the bounce was seen
+FOUND = 27  # the solution (10)
+NORMAL = FOUND + UNKNOWNS  # normal matrix (10, 10), lower triangle
+RIGHT = NORMAL + UNKNOWNS * UNKNOWNS  # right side (10)
+# ... and what the policy may be told
+PRESENT = RIGHT + UNKNOWNS  # position [m] and velocity [m/s] now (6)
+MEETING = PRESENT + 6  # in how long [s], position [m] and velocity [m/s] then (7)
+SPIN = MEETING + 7  # spin behind the bounce [rad/s] (3)
+TRACK = SPIN + 3  # numbers in a row
+
+MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
+SPIN_SIGMA = 50.0  # [rad/s] a axis; balls of the preset `paper`: 45
+DRAG_SIGMA = 0.09  # [-] of the drag factor: uniform in 0.85..1.15
+LEAST_POSITION_NOISE = 0.001  # [m] that samples are taken to have at least: the model isn't perfect either
+LEAST_VELOCITY_NOISE = 0.02  # [m/s]
+TABLE_RESTITUTION0_MEAN, TABLE_RESTITUTION0_SIGMA = 0.975, 0.0144  # [-] of the tables of profile `standard`
+TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-]
+BOUNCE_PLACE_SIGMA = 0.006  # [m] a axis: where the bounce was, as foreseen
+BOUNCE_SPEED_SIGMA = 0.05  # [m/s] a axis: with what velocity
+BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
+# Where lift saturates (at 62 rad/s and 5 m/s) a ball spins faster than its flight shows: so much on average, `paper`
+SATURATED, SATURATED_SIGMA = 1.2, 0.2  # [-] of the spin that the flight shows, and how uncertain that is
+_LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
+_DRAG_FACTOR = AIR_FACTOR * SIMPLE_DRAG
+_STEP = 0.020  # [s] of the flight that is foretold: Runge-Kutta errs by less than 0.01 mm in it
+_LONGEST = 1.0  # [s] farther ahead nothing is foretold
+_SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not foreseen
+
+
+@kernel
+def begin_track(track: Array, seen: Array, position_noise: float, velocity_noise: float) -> None:
+    """Begin a row (TRACK,) with a ball's first sample (position, velocity, ...) and its noise [m], [m/s]."""
+    track[:] = 0.0
+    track[POS : POS + 6] = seen[:6]
+    track[NOMINAL_DRAG], track[LEFT] = 1.0, 1.0
+    position, velocity = max(position_noise, LEAST_POSITION_NOISE), max(velocity_noise, LEAST_VELOCITY_NOISE)
+    for k in range(UNKNOWNS):
+        sigma = position if k < _DV else velocity if k < _SPIN else 1.0
+        track[NORMAL + k * UNKNOWNS + k] = 1.0 / (sigma * sigma)
+
+
+@kernel
+def _weigh_in(track: Array, row: Array, rest: float, sigma: float) -> None:
+    """Add the equation ``row . unknowns = rest`` (+- sigma) to the normal equations."""
+    weight = 1.0 / (sigma * sigma)
+    for i in range(UNKNOWNS):
+        if row[i] != 0.0:
+            scaled = weight * row[i]
+            track[RIGHT + i] += scaled * rest
+            for j in range(i + 1):
+                track[NORMAL + i * UNKNOWNS + j] += scaled * row[j]
+
+
+@kernel
+def _vec(row: Array, at: int) -> Vec:
+    return (row[at], row[at + 1], row[at + 2])
+
+
+@kernel
+def _advance(track: Array, h: float) -> None:
+    """Fly the nominal ball ``h`` seconds on, with all that is summed along it."""
+    v = _vec(track, VEL)
+    drag_factor = track[NOMINAL_DRAG]
+    q, u = flight_step(_vec(track, POS), v, _vec(track, NOMINAL_SPIN), h, drag_factor, 1.0, SIMPLE)
+    before, after = norm(v), norm(u)
+    # Half a step of nominal motion, braked all along: what is left of it is exp(-drag |v| h)
+    left = math.exp(-0.5 * h * _DRAG_FACTOR * drag_factor * (before + after))
+    for k in range(3):
+        way = left * track[WAY + k] + 0.5 * h * (left * v[k] + u[k])
+        track[PATH + k] += 0.5 * h * (track[WAY + k] + way)
+        track[WAY + k] = way
+        braked = -0.5 * h * _DRAG_FACTOR * (left * left * before * v[k] + after * u[k])
+        slowed = left * left * track[SLOWED + k] + braked  # along the flight drag grows twice as fast
+        track[SLOWED_PATH + k] += 0.5 * h * (track[SLOWED + k] + slowed)
+        track[SLOWED + k] = slowed
+        track[POS + k], track[VEL + k] = q[k], u[k]
+    track[LEFT_PATH] += 0.5 * h * track[LEFT] * (1.0 + left)
+    track[LEFT] *= left
+    track[MOMENT] += h
+
+
+@kernel
+def _take(track: Array, seen: Array, moment: float, position_noise: float, velocity_noise: float) -> None:
+    """Add a sample to the fit, and solve it."""
+    _advance(track, moment - track[MOMENT])
+    position, velocity = max(position_noise, LEAST_POSITION_NOISE), max(velocity_noise, LEAST_VELOCITY_NOISE)
+    row = np.empty(UNKNOWNS)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3  # (w x X)_k = w_i X_j - w_j X_i
+        row[:] = 0.0
+        row[k], row[_DV + k] = 1.0, track[LEFT_PATH]
+        row[_SPIN + i] = _LIFT * SPIN_SIGMA * track[PATH + j]
+        row[_SPIN + j] = -_LIFT * SPIN_SIGMA * track[PATH + i]
+        row[_DRAG] = DRAG_SIGMA * track[SLOWED_PATH + k]
+        _weigh_in(track, row, seen[k] - track[POS + k], position)
+        row[:] = 0.0
+        row[_DV + k] = track[LEFT]
+        row[_SPIN + i] = _LIFT * SPIN_SIGMA * track[WAY + j]
+        row[_SPIN + j] = -_LIFT * SPIN_SIGMA * track[WAY + i]
+        row[_DRAG] = DRAG_SIGMA * track[SLOWED + k]
+        _weigh_in(track, row, seen[3 + k] - track[VEL + k], velocity)
+    lower = np.empty((UNKNOWNS, UNKNOWNS))
+    factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
+    substitute(lower, track[RIGHT:PRESENT], track[FOUND:NORMAL])
+
+
+@kernel
+def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
+    """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
+    found = track[FOUND:NORMAL]
+    dw = (SPIN_SIGMA * found[_SPIN], SPIN_SIGMA * found[_SPIN + 1], SPIN_SIGMA * found[_SPIN + 2])
+    k = DRAG_SIGMA * found[_DRAG]
+    x, w = _vec(track, PATH), _vec(track, WAY)
+    turned = (dw[1] * x[2] - dw[2] * x[1], dw[2] * x[0] - dw[0] * x[2], dw[0] * x[1] - dw[1] * x[0])
+    bent = (dw[1] * w[2] - dw[2] * w[1], dw[2] * w[0] - dw[0] * w[2], dw[0] * w[1] - dw[1] * w[0])
+    pos = (
+        track[POS] + found[0] + track[LEFT_PATH] * found[3] + _LIFT * turned[0] + k * track[SLOWED_PATH],
+        track[POS + 1]
+        + found[1]
+        + track[LEFT_PATH] * found[4]
+        + _LIFT * turned[1]
+        + k * track[SLOWED_PATH + 1],
+        track[POS + 2]
+        + found[2]
+        + track[LEFT_PATH] * found[5]
+        + _LIFT * turned[2]
+        + k * track[SLOWED_PATH + 2],
+    )
+    vel = (
+        track[VEL] + track[LEFT] * found[3] + _LIFT * bent[0] + k * track[SLOWED],
+        track[VEL + 1] + track[LEFT] * found[4] + _LIFT * bent[1] + k * track[SLOWED + 1],
+        track[VEL + 2] + track[LEFT] * found[5] + _LIFT * bent[2] + k * track[SLOWED + 2],
+    )
+    spin = (track[NOMINAL_SPIN] + dw[0], track[NOMINAL_SPIN + 1] + dw[1], track[NOMINAL_SPIN + 2] + dw[2])
+    return pos, vel, spin, track[NOMINAL_DRAG] + k
+
+
+@kernel
+def _to_table(pos: Vec, vel: Vec, spin: Vec, drag: float) -> tuple[float, Vec, Vec]:
+    """Return in how long a falling ball is down on the table's height [s], and its position and velocity then.
+
+    Longer than ``_LONGEST``: it doesn't come down so soon. A ball that is down already is flown back.
+    """
+    gone = 0.0
+    while gone < _LONGEST:
+        following, speed = flight_step(pos, vel, spin, _STEP, drag, 1.0, SIMPLE)
+        if following[2] < BALL_RADIUS and speed[2] < 0.0:
+            h = _STEP
+            there, then = following, speed
+            for _ in range(3):  # Newton: the fall is nearly uniform
+                h += (BALL_RADIUS - there[2]) / min(then[2], -0.1)
+                there, then = flight_step(pos, vel, spin, h, drag, 1.0, SIMPLE)
+            return gone + h, there, then
+        pos, vel = following, speed
+        gone += _STEP
+    return 2.0 * _LONGEST, pos, vel
+
+
+@kernel
+def _fly(pos: Vec, vel: Vec, spin: Vec, drag: float, duration: float) -> tuple[Vec, Vec]:
+    """Return position and velocity ``duration`` seconds later; it may be negative."""
+    steps = max(1, math.ceil(abs(duration) / _STEP))
+    for _ in range(steps):
+        pos, vel = flight_step(pos, vel, spin, duration / steps, drag, 1.0, SIMPLE)
+    return pos, vel
+
+
+@kernel
+def _through_bounce(track: Array, vel: Vec, spin: Vec, covariance: Array) -> tuple[Vec, Vec]:
+    """Return velocity and spin to be expected behind the bounce, and write their covariance (6, 6)."""
+    lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
+    inverse(lower, variance)
+    square, spread = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            square[i, j] = (
+                SPIN_SIGMA**2 * variance[_SPIN + i, _SPIN + j] + SATURATED_SIGMA**2 * spin[i] * spin[j]
+            )
+    factor(square, spread)
+    points = np.empty((10, 6))
+    reach = math.sqrt(5.0)
+    for p in range(10):
+        axis, by = p // 2, reach if p % 2 == 0 else -reach
+        turned = spin
+        if axis < 3:
+            turned = (
+                spin[0] + (by * spread[0, 0] if axis == 0 else 0.0),
+                spin[1] + (by * spread[1, axis] if axis <= 1 else 0.0),
+                spin[2] + by * spread[2, axis],
+            )
+        restitution = TABLE_RESTITUTION0_MEAN + (by * TABLE_RESTITUTION0_SIGMA if axis == 3 else 0.0)
+        friction = TABLE_FRICTION_MEAN + (by * TABLE_FRICTION_SIGMA if axis == 4 else 0.0)
+        v, w = table_bounce(vel, turned, (0.0, 0.0, 1.0), restitution, friction)
+        for k in range(3):
+            points[p, k], points[p, 3 + k] = v[k], w[k]
+    mean = np.zeros(6)
+    for p in range(10):
+        mean += 0.1 * points[p]
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for p in range(10):
+                total += 0.1 * (points[p, i] - mean[i]) * (points[p, j] - mean[j])
+            if i == j:
+                total += BOUNCE_SPEED_SIGMA**2 if i < 3 else BOUNCE_SPIN_SIGMA**2
+            covariance[i, j] = total
+    return (mean[0], mean[1], mean[2]), (mean[3], mean[4], mean[5])
+
+
+@kernel
+def _begin_anew(track: Array, moment: float, pos: Vec, vel: Vec, spin: Vec, covariance: Array) -> None:
+    """Let the fit begin at the bounce, with what was known of it as its prior."""
+    drag = track[NOMINAL_DRAG] + DRAG_SIGMA * track[FOUND + _DRAG]
+    information = track[NORMAL + UNKNOWNS * UNKNOWNS - 1]
+    lower, weight = np.empty((6, 6)), np.empty((6, 6))
+    factor(covariance, lower)
+    inverse(lower, weight)
+    track[:BOUNCED] = 0.0
+    track[FOUND:PRESENT] = 0.0
+    for k in range(3):
+        track[POS + k], track[VEL + k], track[NOMINAL_SPIN + k] = pos[k], vel[k], spin[k]
+    track[NOMINAL_DRAG], track[LEFT] = drag, 1.0
+    track[MOMENT], track[BEGUN] = moment, moment
+    for k in range(3):
+        track[NORMAL + k * UNKNOWNS + k] = 1.0 / (BOUNCE_PLACE_SIGMA * BOUNCE_PLACE_SIGMA)
+    for i in range(6):
+        for j in range(i + 1):
+            unit = (SPIN_SIGMA if i >= 3 else 1.0) * (SPIN_SIGMA if j >= 3 else 1.0)
+            track[NORMAL + (_DV + i) * UNKNOWNS + _DV + j] = unit * weight[i, j]
+    track[NORMAL + UNKNOWNS * UNKNOWNS - 1] = information
+    track[BOUNCED] = 1.0
+
+
+@kernel
+def follow(
+    track: Array, seen: Array, moment: float, bounced: bool, position_noise: float, velocity_noise: float
+) -> None:
+    """Let a sample correct the estimate.
+
+    Args:
+        track: (TRACK,); written.
+        seen: Position [m] and velocity [m/s], first six numbers.
+        moment: When it was taken, since launch [s]; no later than the last: nothing new.
+        bounced: Whether it was taken behind the bounce.
+        position_noise: Its sigma a axis [m].
+        velocity_noise: [m/s].
+    """
+    if moment <= track[MOMENT]:
+        return
+    if bounced and track[BOUNCED] == 0.0:
+        pos, vel, spin, drag = _estimate(track)
+        wait, there, then = _to_table(pos, vel, spin, drag)
+        at = track[MOMENT] + wait
+        if abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0:  # believe the sample then
+            at, there = moment, (seen[0], seen[1], seen[2])
+            then = (seen[3], seen[4], -abs(seen[5]))
+        spin = scale(SATURATED, spin)
+        covariance = np.empty((6, 6))
+        vel, spin = _through_bounce(track, then, spin, covariance)
+        _begin_anew(track, at, there, vel, spin, covariance)
+    _take(track, seen, moment, position_noise, velocity_noise)
+
+
+@kernel
+def predict(track: Array, now: float) -> None:
+    """Write where the ball is ``now`` [s since launch], and how it will come to be met."""
+    pos, vel, spin, drag = _estimate(track)
+    ahead = now - track[MOMENT]
+    until = MEETING_AFTER - (track[MOMENT] - track[BEGUN])  # from the last sample to the meeting
+    here, speed = pos, vel
+    if track[BOUNCED] == 0.0:
+        wait, there, then = _to_table(pos, vel, spin, drag)
+        if wait > _LONGEST:  # a ball that doesn't come down on the robot's side, as far as is known
+            until, ahead = 0.0, min(ahead, _LONGEST)
+        else:
+            if ahead < wait:
+                here, speed = _fly(pos, vel, spin, drag, ahead)
+            flat = (then[0], then[1], min(then[2], -0.1))
+            pos = there
+            vel, spin = table_bounce(
+                flat, scale(SATURATED, spin), (0.0, 0.0, 1.0), TABLE_RESTITUTION0_MEAN, TABLE_FRICTION_MEAN
+            )
+            if ahead >= wait:
+                here, speed = _fly(pos, vel, spin, drag, ahead - wait)
+            until = wait + MEETING_AFTER
+            there, then = _fly(pos, vel, spin, drag, MEETING_AFTER)
+    else:
+        here, speed = _fly(pos, vel, spin, drag, ahead)
+        there, then = _fly(pos, vel, spin, drag, until)
+    track[MEETING] = until - ahead
+    for k in range(3):
+        track[PRESENT + k], track[PRESENT + 3 + k] = here[k], speed[k]
+        track[MEETING + 1 + k], track[MEETING + 4 + k] = there[k], then[k]
+        track[SPIN + k] = spin[k]
