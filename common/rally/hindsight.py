@@ -11,9 +11,6 @@ iterative learning control (Arimoto 1984) with a network as its memory. Against 
 the same physics (as in SHAC, Xu et al. 2022) such a step doesn't shout where the stroke is sensitive: the mean over a
 dataset has five times the signal to noise.
 
-L is not that of the drives alone: a policy sees its joints, and answers to a change it didn't mean in the steps that
-follow. What is left of a change (``FELT``) was measured with noise on the actions; earlier ones are all but answered.
-
 Wanted of a hit: that the ball comes down on its target, clears the net by a margin, meets the racket's centre, and not
 so soon after the bounce that it might as well have been before it.
 """
@@ -59,10 +56,7 @@ LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
 SOONEST = 0.100  # [s] after the bounce: by then it has been seen, and tells of the spin; who hits much earlier volleys
 PACE = 3.0  # [m/s] a ball's, about: a contact that is 10 ms too soon weighs as much as 3 cm off the target
-# [-] what an action's change, so many control steps before the contact, still does to the result once the policy has
-# answered to it, of what the drives alone would make of it
-FELT = (0.6, 0.4, 0.25, 0.15, 0.1, 0.08, 0.05, 0.03, 0.03, 0.03, 0.02, 0.02)
-LEVENBERG = 0.3  # [m^2] lambda; L L' is some 1-3 m^2 per (unit of action)^2
+LEVENBERG = 1.0  # [m^2] lambda; L L' is some 25 m^2 per (unit of action)^2
 TRUST = 0.1  # [half-range] size of a whole correction at which it counts half: a larger one leaves the linear model
 _FLIGHT_STEP = 0.010  # [s]
 _DEEPEST = -0.7  # [m] below the table a ball that fell short isn't followed
@@ -363,8 +357,6 @@ def correction(
             h,
             sensitivity[goal],
         )
-    for k in range(out.shape[0]):
-        sensitivity[:, k] *= FELT[k]
     wanted = np.empty(GOALS)
     target_x = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE)
     target_y = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE)

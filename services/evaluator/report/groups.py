@@ -63,6 +63,7 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     collision = f"{env.get('collision', 'tailored')} collisions"
     more = [f"history {seen['history']}"] if seen.get("history", 0) else []
     more += SPINS[seen.get("spin", "hidden")]
+    more += ["prediction"] if seen.get("prediction", False) else []
     more += ["sample age"] if seen.get("age", False) else []
     critic = seen.get("critic", "policy")
     return (

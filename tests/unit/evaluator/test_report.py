@@ -145,6 +145,7 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("c", env=privileged | {"collision": "original"}),
             make_run("d", env={"observation": {"critic": "policy", "history": 8, "spin": "true"}}),
             make_run("e", env={"observation": {"critic": "policy", "spin": "estimated", "age": True}}),
+            make_run("f", env={"observation": {"critic": "privileged", "prediction": True}}),
         ]
     )
 
@@ -154,6 +155,7 @@ def test_groups_are_called_by_what_tells_them_apart():
         "stages 1+2+3, original collisions",
         "stages 1+2+3, history 8 + true spin, critic sees no more",
         "stages 1+2+3, estimated spin + sample age, critic sees no more",
+        "stages 1+2+3, prediction",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"

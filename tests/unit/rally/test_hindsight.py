@@ -16,7 +16,6 @@ from common.rally.hindsight import (
     BOUNCE,
     CONTACT,
     EDGE,
-    FELT,
     FRESH,
     GOALS,
     HIT,
@@ -345,7 +344,6 @@ def test_a_correction_asks_for_target_centre_and_where_it_lacks_height_over_the_
         back_through_drives(
             by_pos[goal], by_vel[goal], hit[MOMENT], free, 3, BACK, late, DRIVES, H, changes[goal]
         )
-    changes *= np.array(FELT)[:, None]  # the policy answers to the rest
     target = np.clip(
         condition[[Condition.TARGET_X, Condition.TARGET_Y]],
         [NEAREST, EDGE - TABLE_HALF_WIDTH],
