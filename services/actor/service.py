@@ -34,6 +34,7 @@ log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.05
 RALLY_BATCHES = 8  # that wait beside the ring until there is room for them
+MOST_RANDOM = 0.05  # [-] share of launches in a block that may be random before the log says so
 REPORT_INTERVAL_S = 0.25  # without credits: no grant can be lost for longer
 ASK_AGAIN_S = 1.0  # for the policy
 ASK_RALLIES_S = 2.0  # for one block
@@ -64,6 +65,7 @@ class ActorService:
         self._config, self._transport, self._metrics = config, transport, metrics
         self._incarnation = incarnation
         self._keys = keys = Keys(config.run)
+        self._dealt, self._runs_short = (0, 0), False  # random launches and rallies at the last block
         self._shard = config.index % config.shards
         seed = int(bits(config.seed, Stream.RESET, config.index)) >> 1
         self._buffer = RallyBuffer(config.envs, config.launch, config.env.noise, seed, self._refill)
@@ -183,6 +185,23 @@ class ActorService:
         for phase, seconds in rollout.seconds.items():
             self._metrics.inc("topspin_phase_seconds_total", seconds, phase=phase)
         self._metrics.inc("topspin_phase_seconds_total", time.monotonic() - played, phase="encode")
+        self._note_underruns()
+
+    def _note_underruns(self) -> None:
+        """Say when rallies begin to run out, and when there are enough again: random launches teach little."""
+        counts = self._buffer.counts
+        random_, dealt = counts.underruns - self._dealt[0], counts.consumed - self._dealt[1]
+        self._dealt = (counts.underruns, counts.consumed)
+        if not self._runs_short and random_ > MOST_RANDOM * (random_ + dealt):
+            self._runs_short = True
+            log.warning(
+                "rallies run out random=%d of=%d launches; raise the generators' rate_hz, or add generators",
+                random_,
+                random_ + dealt,
+            )
+        elif self._runs_short and random_ == 0 and dealt > 0:
+            self._runs_short = False
+            log.info("rallies suffice again")
 
     def _wait_for(self, reason: str, now: float) -> None:
         self.state = "paused" if self._paused else "draining" if self._draining else "waiting"

@@ -24,7 +24,7 @@ class GeneratorConfig(ServiceConfig):
         128, ge=1, le=1000, description="rallies a message", json_schema_extra={"unit": "rallies"}
     )
     rate_hz: float = Field(
-        600.0,
+        1200.0,
         gt=0,
         le=1e6,
         description="rallies published to each shard",

@@ -292,3 +292,19 @@ def test_a_run_that_diverges_with_nothing_to_go_back_to_ends_with_one_line(tmp_p
         newest = checkpoints(tmp_path / "checkpoints")[-1]
 
     assert bool(np.isfinite(load_file(newest)["network.mean.weight"]).all())
+
+
+def test_an_actor_that_runs_out_of_rallies_says_so_once(tmp_path, caplog):
+    curriculum = CURRICULUM.model_copy(update={"stage_1": 40, "stage_2": 0, "stage_3": 0})
+    with caplog.at_level(logging.INFO), stage(tmp_path, curriculum=curriculum) as s:
+        s.learner()
+        s.generator(shards=1, batch=16, rate_hz=2.0)  # enough to begin with, and then next to none
+        actor = s.actor(shards=1)
+        wait_until(lambda: "rallies run out" in caplog.text, 60, "the actor to say what it lacks")
+        wait_until(
+            lambda: actor.metric("topspin_rollouts_published_total") > 20, 60, "some more blocks to be played"
+        )
+
+    assert caplog.text.count("rallies run out") == 1
+    assert "raise the generators' rate_hz, or add generators" in caplog.text
+    assert actor.metric("topspin_rally_underruns_total") > 0
