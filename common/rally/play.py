@@ -27,7 +27,7 @@ from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot_row
 from common.rally.draws import Stream, normal_pair, uniform
-from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, take_shot
+from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
@@ -45,6 +45,7 @@ FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
 SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
 NO_SAMPLE = -1.0  # state of a sample that is none: a path ends before it
+FEWEST_SHOTS = 12  # of the camera, before what the estimator makes of them is followed
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -250,8 +251,10 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
         _sample(rallies, b, step, noise)
     if rallies.track.shape[0] > 0:
         track, now = rallies.track[b], rallies.clock[b] * GRID_STEP
-        if step == 0:
-            begin_track(track, seen, noise.position_noise, noise.velocity_noise)
+        # An estimator's first estimates are its guess at what balls do: they tell of nothing yet
+        guesses = rallies.eyes.shape[0] > 0 and rallies.eyes[b, FILM + COUNT] < FEWEST_SHOTS
+        if step == 0 or (seen[6] == 0.0 and guesses):
+            begin_track(track, seen, seen[_TAKEN], noise.position_noise, noise.velocity_noise)
             predict(track, now)
         elif seen[6] <= 1.0:
             bounced = seen[6] == 1.0

@@ -56,6 +56,8 @@ TRACK = SPIN + 3  # numbers in a row
 MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
 SPIN_SIGMA = 50.0  # [rad/s] a axis; balls of the preset `paper`: 45
 DRAG_SIGMA = 0.09  # [-] of the drag factor: uniform in 0.85..1.15
+MOST_SPIN = 600.0  # [rad/s] that is believed
+MOST_DRAG = 0.5  # [-] that a drag factor is believed to be off
 LEAST_POSITION_NOISE = 0.001  # [m] that samples are taken to have at least: the model isn't perfect either
 LEAST_VELOCITY_NOISE = 0.02  # [m/s]
 TABLE_RESTITUTION0_MEAN, TABLE_RESTITUTION0_SIGMA = 0.975, 0.0144  # [-] of the tables of profile `standard`
@@ -73,9 +75,20 @@ _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not
 
 
 @kernel
-def begin_track(track: Array, seen: Array, position_noise: float, velocity_noise: float) -> None:
-    """Begin a row (TRACK,) with a ball's first sample (position, velocity, ...) and its noise [m], [m/s]."""
+def begin_track(
+    track: Array, seen: Array, moment: float, position_noise: float, velocity_noise: float
+) -> None:
+    """Begin a row (TRACK,) with a ball's first sample.
+
+    Args:
+        track: Written.
+        seen: Position [m] and velocity [m/s], first six numbers.
+        moment: When it was taken, since launch [s].
+        position_noise: Its sigma a axis [m].
+        velocity_noise: [m/s].
+    """
     track[:] = 0.0
+    track[MOMENT], track[BEGUN] = moment, moment
     track[POS : POS + 6] = seen[:6]
     track[NOMINAL_DRAG], track[LEFT] = 1.0, 1.0
     position, velocity = max(position_noise, LEAST_POSITION_NOISE), max(velocity_noise, LEAST_VELOCITY_NOISE)
@@ -177,7 +190,9 @@ def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
         track[VEL + 2] + track[LEFT] * found[5] + _LIFT * bent[2] + k * track[SLOWED + 2],
     )
     spin = (track[NOMINAL_SPIN] + dw[0], track[NOMINAL_SPIN + 1] + dw[1], track[NOMINAL_SPIN + 2] + dw[2])
-    return pos, vel, spin, track[NOMINAL_DRAG] + k
+    # Bad samples must not send the prediction beyond all bounds
+    spin = scale(min(1.0, MOST_SPIN / max(norm(spin), 1.0)), spin)
+    return pos, vel, spin, min(max(track[NOMINAL_DRAG] + k, 1.0 - MOST_DRAG), 1.0 + MOST_DRAG)
 
 
 @kernel
@@ -194,6 +209,7 @@ def _to_table(pos: Vec, vel: Vec, spin: Vec, drag: float) -> tuple[float, Vec, V
             there, then = following, speed
             for _ in range(3):  # Newton: the fall is nearly uniform
                 h += (BALL_RADIUS - there[2]) / min(then[2], -0.1)
+                h = min(max(h, -_STEP), 2.0 * _STEP)  # a ball seen below the table may never have been above it
                 there, then = flight_step(pos, vel, spin, h, drag, 1.0, SIMPLE)
             return gone + h, there, then
         pos, vel = following, speed

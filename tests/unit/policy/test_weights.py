@@ -71,16 +71,16 @@ def test_a_folder_holds_what_acts_and_not_the_critic(tmp_path):
     """So that a policy stays readable when what its critic saw has changed."""
     options = ObservationConfig(history=2)
     network = new_network(SMALL, options)
-    moments = Moments(np.zeros(77), np.ones(77), 5)
+    moments = Moments(np.zeros(90), np.ones(90), 5)
     contract = make_contract(observation=observation_contract(options), observation_options=options)
     save_policy(tmp_path / "p", network, moments, contract)
 
     policy = load_policy(tmp_path / "p")
     tensors = load_file(tmp_path / "p" / WEIGHTS_FILE)
-    obs = np.random.default_rng(0).normal(size=(3, 77)).astype(np.float32)
+    obs = np.random.default_rng(0).normal(size=(3, 90)).astype(np.float32)
 
     assert not any(name.startswith(("value", "judge", "critic")) for name in tensors)
-    assert policy.moments.mean.shape == (37 + 3 + 1 + 2 * 6,)
+    assert policy.moments.mean.shape == (37 + 3 + 13 + 1 + 2 * 6,)
     np.testing.assert_array_equal(policy.act(obs), Policy(network, moments, contract).act(obs))
 
 

@@ -56,7 +56,7 @@ def samples(spin, moments, drag=1.0, noise=(0.0, 0.0), seed=0, vel=FLYING) -> np
 def tracked(seen, moments, noise=(0.0, 0.0)) -> np.ndarray:
     """Return the track of samples (n, 6) from before the bounce."""
     track = np.zeros(TRACK)
-    begin_track(track, seen[0], *noise)
+    begin_track(track, seen[0], moments[0], *noise)
     for sample, moment in zip(seen[1:], moments[1:], strict=True):
         follow(track, sample, moment, False, *noise)
     return track
@@ -268,6 +268,18 @@ def test_a_bounce_that_was_not_foreseen_is_believed():
 
     np.testing.assert_allclose(track[HERE], [-0.3, 0.5, 0.05], atol=0.01)
     assert track[BOUNCED] == 1.0
+
+
+@pytest.mark.parametrize("vertical", [-3.0, 0.0, 2.0])
+@pytest.mark.parametrize("height", [-0.1, 0.0, 0.3, 3.0])
+def test_a_single_wild_sample_leads_to_no_wild_prediction(height, vertical):
+    track = np.zeros(TRACK)
+    begin_track(track, np.array([0.8, 0.3, height, -6.0, 0.0, vertical]), 0.0, *NOISE)
+    follow(track, np.array([-5.0, 2.0, -1.0, 30.0, -20.0, 40.0]), 0.02, False, *NOISE)
+    predict(track, 0.045)
+
+    assert np.isfinite(track).all()
+    assert np.abs(track[PRESENT:]).max() < 1500.0
 
 
 def make_env(count, noise="standard", preset="paper", first=0, deck=300) -> RallyEnv:
