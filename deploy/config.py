@@ -10,6 +10,7 @@ from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
+from services.learner.intake import IntakeConfig
 
 Launch = Literal["paper", "strong", "match"]
 
@@ -20,7 +21,9 @@ class DeployConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     run: str = Field("", description="name of the run; empty: a time stamp. runs/latest points to it")
-    actors: int = Field(2, ge=1, le=1000, description="actor processes")
+    actors: int = Field(
+        1, ge=1, le=1000, description="actor processes: the learner keeps a core busy of its own"
+    )
     generators: int = Field(1, ge=1, le=100, description="generator processes")
     shards: int = Field(0, ge=0, le=4096, description="rally shards; 0: as many as actors")
     minutes: float = Field(
@@ -48,6 +51,24 @@ class DeployConfig(BaseModel):
     actor: ActorConfig = ActorConfig()
     generator: GeneratorConfig = GeneratorConfig()
     evaluator: EvaluatorConfig = EvaluatorConfig()
+
+
+ENVS, ROLLOUTS = ActorConfig().envs, IntakeConfig().dataset_rollouts  # of one actor that works alone
+FEWEST_ENVS = 16
+
+
+def shared_out(config: DeployConfig) -> DeployConfig:
+    """Return ``config`` with its datasets made of one rollout of each actor, unless it asks for something else.
+
+    The actors share the environments that one alone would have: a dataset is as large with any number of them.
+    """
+    actor, learner, intake = config.actor, config.learner, config.learner.intake
+    if (actor.envs, intake.dataset_rollouts) != (ENVS, ROLLOUTS):
+        return config
+    actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
+    intake = intake.model_copy(update={"dataset_rollouts": config.actors})
+    learner = learner.model_copy(update={"intake": intake})
+    return config.model_copy(update={"actor": actor, "learner": learner})
 
 
 def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str) -> dict[str, dict[str, Any]]:

@@ -31,7 +31,7 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
 from common.run_folder import LATEST, RUNS, RunFolder
-from deploy.config import DeployConfig, service_sections
+from deploy.config import DeployConfig, service_sections, shared_out
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
 
@@ -125,6 +125,7 @@ def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
     check_ports(config)
+    config = shared_out(config)
     folder.create()
     # A new endpoint each time unless one was asked for: the old one may be taken.
     sections: dict[str, Any] = service_sections(

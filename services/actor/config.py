@@ -19,7 +19,7 @@ class ActorConfig(ServiceConfig):
     launch: Literal["paper", "strong", "match"] = Field(
         "paper", description="launch preset, as the generators'"
     )
-    envs: int = Field(128, ge=1, le=65536, description="environments played together")
+    envs: int = Field(256, ge=1, le=65536, description="environments played together")
     horizon: int = Field(32, ge=1, le=4096, description="control steps of one rollout")
     index: int = Field(
         0, ge=0, description="number of this actor; decides its action noise and its rally shard"

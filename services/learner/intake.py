@@ -30,7 +30,9 @@ class IntakeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    dataset_rollouts: int = Field(2, ge=1, description="rollouts of one dataset")
+    dataset_rollouts: int = Field(
+        1, ge=1, description="rollouts of one dataset; deploy.local: one of each actor, unless it is given"
+    )
     max_lag: int = Field(
         2, ge=0, le=64, description="versions that a rollout may be behind; 0 is strictly synchronous"
     )

@@ -6,8 +6,8 @@ import pytest
 
 from common.process import BAD_CONFIG
 from deploy.child import Assignment
-from deploy.config import DeployConfig, service_sections
-from deploy.local import check_ports, metrics_ports, settings, specs
+from deploy.config import DeployConfig, service_sections, shared_out
+from deploy.local import check_ports, metrics_ports, prepare, settings, specs
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
@@ -69,9 +69,21 @@ def test_all_sections_agree_on_task_run_and_shards():
     assert sections["actor"]["shards"] == sections["generator"]["shards"] == 3
 
 
-def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_given_now(tmp_path, monkeypatch):
-    from deploy.local import prepare
+@pytest.mark.parametrize(("actors", "envs"), [(1, 256), (2, 128), (8, 32), (100, 16)])
+def test_a_dataset_is_one_rollout_of_each_actor_and_as_large_with_any_number_of_them(actors, envs):
+    config = shared_out(DeployConfig(actors=actors))
 
+    assert (config.actor.envs, config.learner.intake.dataset_rollouts) == (envs, actors)
+
+
+@pytest.mark.parametrize("flags", [("--actor.envs", "64"), ("--learner.intake.dataset-rollouts", "3")])
+def test_environments_and_rollouts_that_were_asked_for_stay(flags):
+    config = settings(["--run", "r", "--actors", "2", *flags])
+
+    assert shared_out(config) == config
+
+
+def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_given_now(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = settings(["--run", "r", "--actors", "5", "--network.units", "8,4", "--evaluator.rallies", "33"])
     prepare(first)
@@ -79,7 +91,9 @@ def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_giv
     again = settings(["--run", "r", "--resume", "--minutes", "3"])
     newest = settings(["--run", "latest", "--resume"])
 
-    assert again == first.model_copy(update={"resume": True, "minutes": 3.0})
+    assert again == shared_out(first).model_copy(update={"resume": True, "minutes": 3.0})
+    assert shared_out(again) == again
+    assert again.actor.envs == 51
     assert newest.run == "r"
 
 
