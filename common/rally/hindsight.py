@@ -49,8 +49,8 @@ HIT = 28
 INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
 
 MARGIN = 0.16  # [m] that the ball should clear the net by
-EDGE = 0.24  # [m] a target nearer to the table's edge than this is aimed at from inside: what misses a little returns
-NEAREST = 0.30  # [m] from the net on that balls are aimed to
+EDGE = 0.30  # [m] a target nearer to the table's edge than this is aimed at from inside: what misses a little returns
+NEAREST = 0.40  # [m] from the net on that balls are aimed to
 LARGEST_MISS = 0.5  # [m] of landing errors as corrected: farther off the linear model says the direction only
 LARGEST_SHORTFALL = 0.25  # [m] of the height over the net
 PLACE_WEIGHT = 5.0  # [-] 1 cm off the racket's centre weighs as much as 5 cm off the target
