@@ -216,21 +216,25 @@ class Played:
     aims: np.ndarray  # (B, 2) what is aimed at: the target, from inside the edges
 
 
-BALLS, LONGEST = 96, 42
+BALLS, LONGEST = 128, 42
+SHAKEN = (
+    0.06  # [half-range] sigma of what is added to the policy's actions: it would leave nothing to correct
+)
 
 
 def played(actions: np.ndarray | None = None) -> Played:
-    """Play the first ball of each environment by the shipped policy, or by given actions."""
+    """Play the first ball of each environment by the shipped policy, shaken, or by given actions."""
     policy = load_policy(POLICY)
     seen = policy.contract.observation_options.model_copy(update={"critic": "policy"})
     config = EnvConfig(observation=seen, go_on=0.0, carry_over=0.0, foresee=1.0)
     env = RallyEnv(BALLS, config, Deck(draw_rallies(BALLS, seed=1)), stage=3)
     obs, conditions, is_first = env.reset(), env.rallies.condition.copy(), np.ones(BALLS, np.bool_)
-    taken, hit_at = [], np.full(BALLS, -1)
+    taken, hit_at, rng = [], np.full(BALLS, -1), np.random.default_rng(0)
     results, found = np.full((BALLS, GOALS), np.nan), np.zeros((BALLS, BACK, 7))
     landings = np.full((BALLS, 2), np.nan)
     for t in range(LONGEST):
-        taken.append(policy.act(obs) if actions is None else actions[t])
+        noise = SHAKEN * rng.standard_normal((BALLS, 7))
+        taken.append(policy.act(obs) + noise if actions is None else actions[t])
         step = env.step(taken[-1])
         obs = step.obs
         for b in np.flatnonzero(is_first & (env.rallies.hit[:, FRESH] == 1.0) & (hit_at < 0)):
@@ -284,28 +288,28 @@ def test_the_same_actions_play_the_same_strokes():
 
 
 def test_corrected_strokes_land_nearer_to_what_they_aim_at():
-    """One linear step each. Measured on 256 balls: 77 % land nearer, 0.32 m -> 0.23 m (median 0.28 -> 0.16 m)."""
+    """One linear step each. Measured: 96 % land nearer, 0.29 m -> 0.17 m."""
     before, after = first_time(), corrected()
     both = (before.hit_at >= 0) & (after.hit_at >= 0)
     was, is_now = (np.linalg.norm(p.results[both, :2] - p.aims[both], axis=1) for p in (before, after))
 
-    assert both.sum() >= 0.95 * (before.hit_at >= 0).sum() > 80
-    assert (is_now < was).mean() > 0.65
-    assert is_now.mean() < 0.85 * was.mean()
+    assert both.sum() >= 0.95 * (before.hit_at >= 0).sum() > 110
+    assert (is_now < was).mean() > 0.85
+    assert is_now.mean() < 0.75 * was.mean()
 
 
 def test_corrected_strokes_meet_the_ball_nearer_to_the_rackets_centre():
-    """Measured: over 90 % of them, 36 mm -> 21 mm (results hold five times as much): large corrections count less."""
+    """Measured: 92 % of them, 21 mm -> 12 mm."""
     before, after = first_time(), corrected()
     both = (before.hit_at >= 0) & (after.hit_at >= 0)
     was, is_now = (np.linalg.norm(p.results[both, 2:4], axis=1) for p in (before, after))
 
-    assert (is_now < was).mean() > 0.9
+    assert (is_now < was).mean() > 0.85
     assert is_now.mean() < 0.75 * was.mean()
 
 
 def test_more_corrected_strokes_return_the_ball():
-    """Measured: 79 % -> 86 %."""
+    """Measured: 80 % -> 94 %."""
     before, after = first_time(), corrected()
 
-    assert np.isfinite(after.landings[:, 0]).sum() > np.isfinite(before.landings[:, 0]).sum()
+    assert np.isfinite(after.landings[:, 0]).mean() > np.isfinite(before.landings[:, 0]).mean() + 0.05
