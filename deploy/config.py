@@ -22,7 +22,11 @@ class DeployConfig(BaseModel):
 
     run: str = Field("", description="name of the run; empty: a time stamp. runs/latest points to it")
     actors: int = Field(
-        1, ge=1, le=1000, description="actor processes: the learner keeps a core busy of its own"
+        1,
+        ge=1,
+        le=1000,
+        description="actor processes; they share 256 environments, or have --actor.envs each. The learner keeps a "
+        "core busy of its own",
     )
     generators: int = Field(1, ge=1, le=100, description="generator processes")
     shards: int = Field(0, ge=0, le=4096, description="rally shards; 0: as many as actors")
@@ -58,15 +62,15 @@ FEWEST_ENVS = 16
 
 
 def shared_out(config: DeployConfig) -> DeployConfig:
-    """Return ``config`` with its datasets made of one rollout of each actor, unless it asks for something else.
+    """Return ``config`` with its datasets made of one rollout of each actor, which share one actor's environments.
 
-    The actors share the environments that one alone would have: a dataset is as large with any number of them.
+    So a dataset is as large with any number of them. What was asked for, other than what is usual, stays.
     """
     actor, learner, intake = config.actor, config.learner, config.learner.intake
-    if (actor.envs, intake.dataset_rollouts) != (ENVS, ROLLOUTS):
-        return config
-    actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
-    intake = intake.model_copy(update={"dataset_rollouts": config.actors})
+    if actor.envs == ENVS:
+        actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
+    if intake.dataset_rollouts == ROLLOUTS:
+        intake = intake.model_copy(update={"dataset_rollouts": config.actors})
     learner = learner.model_copy(update={"intake": intake})
     return config.model_copy(update={"actor": actor, "learner": learner})
 

@@ -209,9 +209,8 @@ def _to_table(pos: Vec, vel: Vec, spin: Vec, drag: float) -> tuple[float, Vec, V
             there, then = following, speed
             for _ in range(3):  # Newton: the fall is nearly uniform
                 h += (BALL_RADIUS - there[2]) / min(then[2], -0.1)
-                h = min(
-                    max(h, -_STEP), 2.0 * _STEP
-                )  # a ball seen below the table may never have been above it
+                # A ball that was seen below the table may never have been above it
+                h = min(max(h, -_STEP), 2.0 * _STEP)
                 there, then = flight_step(pos, vel, spin, h, drag, 1.0, SIMPLE)
             return gone + h, there, then
         pos, vel = following, speed

@@ -264,7 +264,7 @@ def _stage_marks(
         for stage, frames in training.stage_changes():
             x = np.interp(frames, training.frames, training.seconds) / 60 if by_time else frames / 1e6
             marks.setdefault(round(float(x), 1), []).append((stage, colours[one.label]))
-    for x, found in marks.items():
+    for k, (x, found) in enumerate(sorted(marks.items())):
         stage, colour = found[0]
         colour = colour if len(found) == 1 else "#777777"
         for ax in axes:
@@ -274,7 +274,7 @@ def _stage_marks(
             STAGE_NAMES.get(stage, str(stage)),
             (x, 0.0),
             xycoords=("data", "axes fraction"),
-            xytext=(2, 3),
+            xytext=(2, 3 + 9 * (k % 2)),  # short stages' names would lie on each other
             textcoords="offset points",
             fontsize=7.5,
             color=colour,

@@ -76,10 +76,14 @@ def test_a_dataset_is_one_rollout_of_each_actor_and_as_large_with_any_number_of_
     assert (config.actor.envs, config.learner.intake.dataset_rollouts) == (envs, actors)
 
 
-@pytest.mark.parametrize("flags", [("--actor.envs", "64"), ("--learner.intake.dataset-rollouts", "3")])
-def test_environments_and_rollouts_that_were_asked_for_stay(flags):
-    config = settings(["--run", "r", "--actors", "2", *flags])
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [(("--actor.envs", "64"), (64, 2)), (("--learner.intake.dataset-rollouts", "3"), (128, 3))],
+)
+def test_environments_and_rollouts_that_were_asked_for_stay(flags, expected):
+    config = shared_out(settings(["--run", "r", "--actors", "2", *flags]))
 
+    assert (config.actor.envs, config.learner.intake.dataset_rollouts) == expected
     assert shared_out(config) == config
 
 
