@@ -13,7 +13,8 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from common.env.rally_env import EnvConfig, Launches, RallyEnv
+from benchmarks.env import MemoryRallies
+from common.env.rally_env import EnvConfig, RallyEnv
 from common.physics.constants import GRID_STEP
 from common.physics.flight import SIMPLE, flight_step
 from common.physics.fly import NO_ROBOT, fly_to_touch
@@ -30,19 +31,6 @@ Array = npt.NDArray[np.float64]
 STEPS = 40  # control steps watched: 0.8 s
 MOMENTS_MS = (-300, -200, -100, -40, 0, 40, 80, 120, 200)  # since the bounce, to the nearest control step
 FEWEST = 50  # balls at a moment that it is reported for
-
-
-class Once:
-    """A source that deals a block's rallies in order, again and again."""
-
-    def __init__(self, block: RallyBlock) -> None:
-        self._block, self._dealt = block, 0
-
-    def take(self, count: int) -> Launches:
-        """Return the next ``count`` launches."""
-        rows = (self._dealt + np.arange(count)) % len(self._block.seeds)
-        self._dealt += count
-        return Launches(self._block.launches[rows], self._block.seeds[rows], np.ones(count, np.bool_))
 
 
 def truth(block: RallyBlock, conditions: Array) -> tuple[Array, Array]:
@@ -62,7 +50,7 @@ def truth(block: RallyBlock, conditions: Array) -> tuple[Array, Array]:
 def watch(balls: int, preset: str, noise: str, seed: int) -> dict[int, Array]:
     """Return errors by moment since the bounce [ms]: rows of present 6, meeting 6, spin 3, and the sample's own 6."""
     block = draw_rallies(balls, seed=seed, preset=preset, noise=noise)
-    env = RallyEnv(balls, EnvConfig(noise=noise, foresee=0.0, go_on=0.0), Once(block))
+    env = RallyEnv(balls, EnvConfig(noise=noise, foresee=0.0, go_on=0.0), MemoryRallies(block))
     env.reset()
     rallies, hold = env.rallies, np.tile(env.home_action, (balls, 1))
     bounce, meeting = truth(block, rallies.condition)

@@ -31,7 +31,7 @@ from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at,
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
-from common.rally.prediction import PRESENT, SPIN, TRACK, begin_track, follow, predict
+from common.rally.prediction import PREDICTED, PRESENT, SPIN, TRACK, begin_track, follow, predict
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
 Array = npt.NDArray[np.float64]
@@ -691,9 +691,9 @@ def observe(
                 o[at + j] = rallies.ball[b, 6 + j] if spin == SPIN_TRUE else rallies.track[b, SPIN + j]
             at += 3
         if predicted:
-            for j in range(13):
+            for j in range(PREDICTED):
                 o[at + j] = rallies.track[b, PRESENT + j]
-            at += 13
+            at += PREDICTED
         if age:
             o[at] = rallies.clock[b] * GRID_STEP - rallies.seen[b, _TAKEN]
             at += 1

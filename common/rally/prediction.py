@@ -52,6 +52,7 @@ PRESENT = RIGHT + UNKNOWNS  # position [m] and velocity [m/s] now (6)
 MEETING = PRESENT + 6  # in how long [s], position [m] and velocity [m/s] then (7)
 SPIN = MEETING + 7  # spin behind the bounce [rad/s] (3)
 TRACK = SPIN + 3  # numbers in a row
+PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and meeting
 
 MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
 SPIN_SIGMA = 50.0  # [rad/s] a axis; balls of the preset `paper`: 45

@@ -308,7 +308,7 @@ def test_on_paper_balls_with_standard_noise_the_present_is_known_to_millimetres(
 
 
 def test_on_paper_balls_the_spin_is_found_to_half_before_and_to_a_third_behind_the_bounce():
-    """Root mean squares behind the bounce. Measured: 22, 17, 18 of 41, 44, 45 rad/s; 80 ms later 8, 12, 16."""
+    """Root mean squares behind the bounce. Measured: 22, 16, 17 of 41, 44, 45 rad/s; 80 ms later 8, 11, 13."""
     env = make_env(300)
     found = {False: [], True: []}
     in_play = np.ones(300, np.bool_)
