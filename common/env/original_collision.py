@@ -3,7 +3,8 @@
 For comparison with the tailored collisions (the paper's Policy 3). Rules, reward, noise of camera and drives, and
 the air are the same; restitution and friction are MuJoCo's and don't vary from rally to rally. The air's force is
 the tailored flight's acceleration, renewed on the same 5 ms grid and held in between: a control step is a few short
-rollouts, never a loop over environments.
+rollouts, never a loop over environments. Contacts need a short time step, and are rare: on each piece of the grid
+balls with an obstacle within reach are stepped finely, the others take it in one step.
 
 A touch is the first substep in which MuJoCo reports a contact with an obstacle that the ball was free of. MuJoCo's
 contacts are springs: one lasts some substeps, and the ball sinks in by up to 0.45 mm per m/s at the racket. The
@@ -19,19 +20,30 @@ import numpy.typing as npt
 from common.env.robot import MODEL_PATH, RobotBatch, RobotPreset, limit_speeds
 from common.jit import kernel
 from common.physics import touch
-from common.physics.arm import joint_rates_at, joints_at, point_velocity, racket_motion, racket_pose
+from common.physics.arm import (
+    joint_rates_at,
+    joints_at,
+    point_velocity,
+    racket_motion,
+    racket_pose,
+    speed_bound,
+)
 from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS, GRAVITY, GRID_STEP, TABLE_FRICTION
 from common.physics.flight import acceleration
-from common.physics.vec import Vec, add, axpy, cross, scale
+from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
 from common.rally import play
+from common.rally.hindsight import BOUNCE, FRESH, note_hit, note_leaving
 from common.rally.noise import NoiseProfile
 from common.rally.trajectory import State
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 STEP = 0.0005  # [s] at 1 ms a fast ball meets the racket in a single step, and its restitution is chance
 SUBSTEPS = round(GRID_STEP / STEP)  # of one rollout: the air's force is held
+CLEARANCE = 0.010  # [m] MuJoCo's beam has corners, 8 mm beyond ours
+SPEEDING_UP = 3.0  # [m/s] by which ball and robot together close faster at the end of 5 ms, at most
 FREE_SUBSTEPS = 4  # a contact that reopens within 2 ms is still the same one
 
 
@@ -71,6 +83,7 @@ OBSTACLES: Final[tuple[tuple[str, touch.Touch, Surface], ...]] = (
 )
 # Touch sensors of the robot that feel the ball too, as (sensor, obstacle): the penalty F_c leaves the ball out
 _FELT: Final = ((0, 4), (1, 5), (2, 6), (3, 0), (3, 7))
+_RACKET_ROW = 0  # of OBSTACLES
 _TOUCHES = tuple(int(what) for _, what, _ in OBSTACLES)
 _ROBOT_SENSORS = 4
 _BALL_POS, _BALL_TURN, _BALL_VEL, _BALL_SPIN = 7, 10, 7, 10  # where they begin in qpos and qvel
@@ -141,6 +154,56 @@ def _blow(qpos: Array, qvel: Array, condition: Array, model: int, force: Array) 
         force[b, 2] = BALL_MASS * (a[2] + GRAVITY)  # gravity is MuJoCo's
 
 
+@kernel
+def _closes(gap: float, normal: Vec, vel: Vec, robot_speed: float) -> bool:
+    """Return whether a gap to something convex may close before the grid's next point.
+
+    Such a gap is a convex function of the ball's position: it grows by no less than its slope says.
+    """
+    closing = max(robot_speed - dot(normal, vel), 0.0) + SPEEDING_UP
+    return gap < CLEARANCE + GRID_STEP * closing
+
+
+@kernel
+def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
+    """Write which balls may touch something before the grid's next point.
+
+    Args:
+        qpos: Positions (B, 14).
+        qvel: Velocities (B, 13).
+        path: Scratch (2, 7).
+        out: (B,); written.
+    """
+    still = (0.0, 0.0, 0.0)
+    for b in range(qpos.shape[0]):
+        p, v = qpos[b, _BALL_POS:], qvel[b, _BALL_VEL:]
+        pos, vel = (p[0], p[1], p[2]), (v[0], v[1], v[2])
+        table, on_table = touch.table_gap(pos)
+        net, on_net = touch.net_gap(pos)
+        floor, on_floor = touch.floor_gap(pos)
+        out[b] = (
+            _closes(table, on_table, vel, 0.0)
+            or _closes(net, on_net, vel, 0.0)
+            or _closes(floor, on_floor, vel, 0.0)
+        )
+        for j in range(7):
+            path[0, j], path[1, j] = qpos[b, j], qpos[b, j] + GRID_STEP * qvel[b, j]
+        speed = speed_bound(path, GRID_STEP)
+        q = joints_at(path, 0.0, GRID_STEP)
+        if out[b] or not _closes(touch.robot_gap_bound(pos, q), still, vel, norm(vel) + speed):
+            continue
+        racket, on_racket = touch.racket_gap(pos, racket_pose(q))
+        body, on_body = touch.body_gap(pos, q)
+        out[b] = _closes(racket, on_racket, vel, speed) or _closes(body, on_body, vel, speed)
+
+
+def _line(start: Array, end: Array) -> Array:
+    """Return ``SUBSTEPS`` records (n, SUBSTEPS, ...) on the straight line from ``start`` to ``end`` (n, ...)."""
+    share = np.arange(1, SUBSTEPS + 1).reshape(-1, *[1] * (start.ndim - 1)) / SUBSTEPS
+    line: Array = start[:, None] + share * (end - start)[:, None]
+    return line
+
+
 class RobotAndBall(RobotBatch):
     """B simulations of robot and ball.
 
@@ -161,7 +224,9 @@ class RobotAndBall(RobotBatch):
         self.qvel: Array = self.batch.bind("qvel")
         self.condition: Array = np.ones((count, 2))  # factors of drag and lift
         self._flight_model = flight_model
-        self._parts: dict[str, Array] = {}
+        self._time_step: Array = self.batch.expand("opt.timestep")
+        self._is_near = np.zeros(count, np.bool_)
+        self._path = np.empty((2, 7))
 
     @property
     def records(self) -> dict[str, Array]:
@@ -175,23 +240,50 @@ class RobotAndBall(RobotBatch):
         self.qvel[rows, _BALL_VEL:] = ball[:, 3:]  # unturned, so that its own frame is the world's
 
     def _advance(self, control: Array) -> dict[str, Array]:
-        fields = ("qpos", "qvel", "actuator_force", "sensordata")
         for first in range(0, self.substeps, SUBSTEPS):
             _blow(self.qpos, self.qvel, self.condition, self._flight_model, self.ball_force)
+            _within_reach(self.qpos, self.qvel, self._path, self._is_near)
             part = slice(first, first + SUBSTEPS)
-            self._parts = self.batch.rollout(
-                SUBSTEPS,
-                control=control[:, part],
-                control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
-                record=fields,
-                out=self._parts,
-            )
-            for field, values in self._parts.items():
-                if field not in self._records:
-                    shape = (self.count, self.substeps, *values.shape[2:])
-                    self._records[field] = np.empty(shape, values.dtype)
-                self._records[field][:, part] = values
+            near, far = np.flatnonzero(self._is_near), np.flatnonzero(~self._is_near)
+            if near.size:
+                self._record(near, part, self._roll_out(near, STEP, control[near, part]))
+            if far.size:
+                self._record(far, part, self._stride(far, control[far, first : first + 1]))
         return self._records
+
+    def _roll_out(self, rows: Rows, step: float, control: Array) -> dict[str, Array]:
+        """Return records (n, m, ...) of MuJoCo's steps of ``step`` seconds under controls (n, m, 7)."""
+        self._time_step[rows] = step
+        played: dict[str, Array] = self.batch.rollout(
+            control.shape[1],
+            control=control,
+            control_spec=int(mujoco.mjtState.mjSTATE_CTRL),
+            record=("qpos", "qvel", "actuator_force", "sensordata"),
+            ids=rows,
+        )
+        return played
+
+    def _stride(self, rows: Rows, control: Array) -> dict[str, Array]:
+        """Return records as of fine steps, of one step to the grid's next point."""
+        start = {"qpos": self.qpos[rows], "qvel": self.qvel[rows]}
+        played = self._roll_out(rows, GRID_STEP, control)
+        # MuJoCo moves by the velocity at a step's end: under an acceleration a it is ahead by a h^2 / 2
+        ahead = 0.5 * GRID_STEP**2 * (self.ball_force[rows, :3] / BALL_MASS - (0.0, 0.0, GRAVITY))
+        played["qpos"][:, 0, _BALL_POS:_BALL_TURN] -= ahead
+        self.qpos[rows, _BALL_POS:_BALL_TURN] -= ahead
+        return {
+            field: _line(start[field], values[:, 0])
+            if field in start
+            else np.repeat(values, SUBSTEPS, axis=1)
+            for field, values in played.items()
+        }
+
+    def _record(self, rows: Rows, part: slice, played: dict[str, Array]) -> None:
+        for field, values in played.items():
+            if field not in self._records:
+                shape = (self.count, self.substeps, *values.shape[2:])
+                self._records[field] = np.empty(shape, values.dtype)
+            self._records[field][rows, part] = values
 
 
 @kernel
@@ -226,9 +318,13 @@ def _follow(
     state, outcome = rallies.state[b], 0
     bounced, hit, landed = False, False, False
     racket_speed = 0.0
+    is_pressed = False  # by this control step's hit; one that outlasts the step is not reviewed
     per_grid_step = qpos.shape[0] // rules.grid_steps
-    filmed = rallies.eyes.shape[0] > 0
+    filmed, reviewed = rallies.eyes.shape[0] > 0, rallies.hit.shape[0] > 0
+    if reviewed:
+        rallies.hit[b, FRESH] = 0.0
     for k in range(qpos.shape[0]):
+        since_launch = rallies.clock[b] * GRID_STEP + (k % per_grid_step) * motion.step
         for obstacle in range(found.shape[1]):
             is_new = found[k, obstacle] > 0.0 and free[obstacle] > FREE_SUBSTEPS
             free[obstacle] = 0 if found[k, obstacle] > 0.0 else free[obstacle] + 1
@@ -241,11 +337,18 @@ def _follow(
                 moment = k * motion.step
                 joints = joints_at(path, moment, motion.step)
                 pose = racket_pose(joints)
-                racket_vel, racket_spin = racket_motion(joints, joint_rates_at(path, moment, motion.step))
+                rates = joint_rates_at(path, moment, motion.step)
+                racket_vel, racket_spin = racket_motion(joints, rates)
                 contact = axpy(-BALL_RADIUS, touch.racket_gap(pos, pose)[1], pos)
                 surface_vel = point_velocity(pose.centre, racket_vel, racket_spin, contact)
                 racket_speed = min(max(surface_vel[0], 0.0), play.MAX_SPEED_REWARDED)
+                if reviewed and rules.transitions[state, _RACKET] == _TAU_2:
+                    now = rallies.clock[b] // rules.grid_steps
+                    note_hit(rallies.hit[b], pos, vel, spin, joints, rates, moment, now, since_launch)
+                    is_pressed = True
             state, outcome = play.judge(rallies, b, state, what, pos, rules)
+            if reviewed and state == _TAU_1:
+                rallies.hit[b, BOUNCE] = since_launch
         if outcome == 0:
             p, v, w = qpos[k, _BALL_POS:], qvel[k, _BALL_VEL:], qvel[k, _BALL_SPIN:]
             p0, v0 = pos, vel
@@ -255,6 +358,9 @@ def _follow(
                     rallies, b, noise, (k % per_grid_step) * motion.step, p0, v0, motion.step, pos, vel
                 )
             spin = _turned(qpos[k, _BALL_TURN:], (w[0], w[1], w[2]))
+            if is_pressed and free[_RACKET_ROW] > 0:
+                note_leaving(rallies.hit[b], pos, vel, spin)
+                is_pressed = False
             if abs(pos[0]) > touch.PLAY_X or abs(pos[1]) > touch.PLAY_Y:
                 state, outcome = play.judge(rallies, b, state, _OUT, pos, rules)
             if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:

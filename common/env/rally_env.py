@@ -305,10 +305,8 @@ class RallyEnv:
         return TailoredCollision(RobotBatch(self.count, preset, rate, threads=threads))
 
     def _make_review(self) -> Review | None:
-        """Return who corrects hits; MuJoCo's own contact has no law to differentiate."""
-        if not self.config.hindsight or self.config.collision == "original":
-            return None
-        return Review(self.robot, self._flight_model)
+        """Return who corrects hits, if anybody does."""
+        return Review(self.robot, self._flight_model) if self.config.hindsight else None
 
     def _observe(self, rows: Rows) -> None:
         """Write the observations of ``rows``."""

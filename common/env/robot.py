@@ -23,6 +23,7 @@ MUJOCO_STEP = 0.004  # [s] racket pose against 0.25 ms: tests/unit/env/test_robo
 MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: 200 Hz, 100 Hz
 JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
 RACKET_BODY = "racket"
+_UNDER_WAY = 1.0  # [s] MuJoCo's time as a control step begins: a simulation that was reset shows
 MAX_ACTION_LATENCY = 0.020  # [s] how far back targets are kept: the latest of any noise profile
 
 # Published limits of the group's robot: rails [m/s], yaw and pitch, the last three joints [rad/s]
@@ -115,7 +116,6 @@ class RobotBatch:
         self._bias: Array = self.batch.expand("actuator_biasprm")
         self._damping: Array = self.batch.expand("dof_damping")
         self._time: Array = self.batch.bind("time")
-        self._clock = np.zeros(count)
         self.faulty: Rows = np.zeros(0, np.int64)
         # Targets of the control steps before this one, newest first: a latency may exceed a control period.
         self._held: Array = np.tile(self.home, (math.ceil(MAX_ACTION_LATENCY / period - 1e-9), count, 1))
@@ -162,7 +162,7 @@ class RobotBatch:
         """
         target = self.middle + self.half_range * actions
         self._start[:] = self.joint_pos
-        self._clock[:] = self._time.reshape(-1)
+        self._time[:] = _UNDER_WAY
         np.copyto(self._control, target[:, None, :])
         for age, held in enumerate(self._held):
             late = self._substep_index < self._late_substeps[:, None] - age * self.substeps
@@ -170,8 +170,8 @@ class RobotBatch:
         self._held[1:] = self._held[:-1]
         self._held[0] = target
         r = self._records = self._advance(self._control)
-        # MuJoCo resets a simulation that meets NaN or huge numbers, and stops its rollout: its time falls behind.
-        behind = self._clock + self.substeps * self.step_s - self._time.reshape(-1)
+        # MuJoCo resets a simulation that meets NaN or huge numbers: its time starts at 0 again.
+        behind = _UNDER_WAY + self.substeps * self.step_s - self._time.reshape(-1)
         self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
         if self.faulty.size:
             self._recover(self.faulty)

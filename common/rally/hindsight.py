@@ -11,6 +11,9 @@ iterative learning control (Arimoto 1984) with a network as its memory. Against 
 the same physics (as in SHAC, Xu et al. 2022) such a step doesn't shout where the stroke is sensitive: the mean over a
 dataset has five times the signal to noise.
 
+Where the ball went is known from how it left, whoever let it bounce; only L is our own law's. So the simulator's own
+contacts (``original_collision``) are corrected by what they did, along the way that our racket would have it.
+
 Wanted of a hit: that the ball comes down on its target, clears the net by a margin, meets the racket's centre, and not
 so soon after the bounce that it might as well have been before it.
 """
@@ -41,9 +44,10 @@ GOALS = 6
 # Columns of a hit's row: the ball as it met the racket, the joints then, and when in its control step that was [s]
 BALL_POS, BALL_VEL, BALL_SPIN, JOINT_POS, JOINT_VEL, MOMENT = 0, 3, 6, 9, 16, 23
 STEP = 24  # number of that control step in the rally, from 0
-FRESH = 25  # 1: it was in the newest control step
+FRESH = 25  # 1: contact and leaving were in the newest control step
 BOUNCE, CONTACT = 26, 27  # when the ball met the robot's court, and the racket, since launch [s]
-HIT = 28
+LEFT_POS, LEFT_VEL, LEFT_SPIN = 28, 31, 34  # the ball as it left the racket
+HIT = 37
 
 # Rows of the drives' table (5, 7)
 INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
@@ -77,16 +81,24 @@ def note_hit(
     step: int,
     contact: float,
 ) -> None:
-    """Write ball and joints at a contact into a hit's row (HIT,)."""
+    """Write ball and joints at a contact into a hit's row (HIT,); it is fresh once the ball has left."""
     for k in range(3):
         hit[BALL_POS + k], hit[BALL_VEL + k], hit[BALL_SPIN + k] = pos[k], vel[k], spin[k]
     for j in range(7):
         hit[JOINT_POS + j], hit[JOINT_VEL + j] = joints[j], rates[j]
-    hit[MOMENT], hit[STEP], hit[FRESH], hit[CONTACT] = moment, step, 1.0, contact
+    hit[MOMENT], hit[STEP], hit[FRESH], hit[CONTACT] = moment, step, 0.0, contact
 
 
 @kernel
-def _flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, float]:
+def note_leaving(hit: Array, pos: Vec, vel: Vec, spin: Vec) -> None:
+    """Write the ball as it left the racket into the row of its hit."""
+    for k in range(3):
+        hit[LEFT_POS + k], hit[LEFT_VEL + k], hit[LEFT_SPIN + k] = pos[k], vel[k], spin[k]
+    hit[FRESH] = 1.0
+
+
+@kernel
+def flies_to(pos: Vec, vel: Vec, spin: Vec, condition: Array, model: int) -> tuple[float, float, float]:
     """Return where a ball comes down to the table's height, x and y [m], and by how much it clears the net [m].
 
     Unlike in ``heading.heading`` a ball that comes down before the net is followed on below the table: by how much it
@@ -162,7 +174,7 @@ def hit_result(
     vel, spin = racket_bounce(
         vel, spin, normal, surface_vel, condition[4], condition[5], condition[6], condition[7], np.inf
     )
-    x, y, over_net = _flies_to(pos, vel, spin, condition, model)
+    x, y, over_net = flies_to(pos, vel, spin, condition, model)
     side, up = PLACE_WEIGHT * dot(offset, pose.side), PLACE_WEIGHT * dot(offset, pose.up)
     return x, y, side, up, over_net, PACE * later
 
@@ -187,10 +199,15 @@ def _joints(hit: Array, at: int) -> Joints:
 
 
 @kernel
+def _vec(hit: Array, at: int) -> Vec:
+    return (hit[at], hit[at + 1], hit[at + 2])
+
+
+@kernel
 def hit_sensitivity(
     hit: Array, condition: Array, model: int, by_pos: Array, by_vel: Array
 ) -> tuple[float, float, float, float, float, float]:
-    """Write how a hit's result depends on the joints at the contact, and return the result.
+    """Write how a hit's result depends on the joints at the contact, and return the result as our racket has it.
 
     Args:
         hit: (HIT,).
@@ -199,9 +216,7 @@ def hit_sensitivity(
         by_pos: (GOALS, 7) d result / d joint position; written.
         by_vel: (GOALS, 7) d result / d joint velocity; written.
     """
-    pos = (hit[BALL_POS], hit[BALL_POS + 1], hit[BALL_POS + 2])
-    vel = (hit[BALL_VEL], hit[BALL_VEL + 1], hit[BALL_VEL + 2])
-    spin = (hit[BALL_SPIN], hit[BALL_SPIN + 1], hit[BALL_SPIN + 2])
+    pos, vel, spin = _vec(hit, BALL_POS), _vec(hit, BALL_VEL), _vec(hit, BALL_SPIN)
     q, qd = _joints(hit, JOINT_POS), _joints(hit, JOINT_VEL)
     result = hit_result(q, qd, pos, vel, spin, condition, model)
     for joint in range(7):
@@ -327,7 +342,7 @@ def correction(
     """Write the least change of the last actions that would have taken a hit where it should go, linearised.
 
     Args:
-        hit: (HIT,) ball and joints at the contact.
+        hit: (HIT,) ball and joints at the contact, and the ball as it left.
         condition: (14,).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
         limited: See ``back_through_drives``, as the next four.
@@ -360,15 +375,18 @@ def correction(
     wanted = np.empty(GOALS)
     target_x = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE)
     target_y = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE)
-    miss_x, miss_y = target_x - result[_LANDING], target_y - result[_LANDING + 1]
+    x, y, over_net = flies_to(
+        _vec(hit, LEFT_POS), _vec(hit, LEFT_VEL), _vec(hit, LEFT_SPIN), condition, model
+    )
+    miss_x, miss_y = target_x - x, target_y - y
     miss = math.sqrt(miss_x * miss_x + miss_y * miss_y)
     if miss > LARGEST_MISS:
         miss_x *= LARGEST_MISS / miss
         miss_y *= LARGEST_MISS / miss
     wanted[_LANDING], wanted[_LANDING + 1] = miss_x, miss_y
     wanted[_PLACE], wanted[_PLACE + 1] = -result[_PLACE], -result[_PLACE + 1]
-    wanted[_OVER] = min(MARGIN - result[_OVER], LARGEST_SHORTFALL)
-    if not NOT_THAT_FAR < result[_OVER] < MARGIN:
+    wanted[_OVER] = min(MARGIN - over_net, LARGEST_SHORTFALL)
+    if not NOT_THAT_FAR < over_net < MARGIN:
         wanted[_OVER], sensitivity[_OVER] = 0.0, 0.0
     wanted[_LATER] = PACE * (SOONEST - (hit[CONTACT] - hit[BOUNCE]))
     if wanted[_LATER] <= 0.0:

@@ -29,7 +29,7 @@ from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot
 from common.rally.draws import Stream, normal_pair, uniform
 from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
-from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit
+from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit, note_leaving
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
 from common.rally.prediction import PREDICTED, PRESENT, SPIN, TRACK, begin_track, follow, predict
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
@@ -459,7 +459,8 @@ def _fly_one(
                 surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
                 if dot(sub(vel, surface_vel), normal) >= 0.0:
                     continue  # a graze that is over as it begins: no contact without approach
-                if reviewed and rules.transitions[state, RACKET] == _TAU_2:
+                legal = rules.transitions[state, RACKET] == _TAU_2
+                if reviewed and legal:
                     since = rallies.clock[b] * GRID_STEP + (GRID_STEP - rest)
                     now = rallies.clock[b] // rules.grid_steps
                     rates = joint_rates_at(path, moment, motion.step)
@@ -476,6 +477,8 @@ def _fly_one(
                     condition[7],
                     np.inf,
                 )
+                if reviewed and legal:
+                    note_leaving(rallies.hit[b], pos, vel, spin)
                 impulse = scale(BALL_MASS, sub(before, vel))
                 turn = cross(sub(contact, centre), impulse)
                 for k in range(3):

@@ -234,9 +234,7 @@ def test_a_blocks_corrections_are_those_of_its_hits_but_where_an_action_was_clip
     np.testing.assert_array_equal(block.corrections, expected)
 
 
-@pytest.mark.parametrize(
-    ("stage", "changes"), [(1, {}), (2, {}), (3, {"hindsight": False}), (3, {"collision": "original"})]
-)
+@pytest.mark.parametrize(("stage", "changes"), [(1, {}), (2, {}), (3, {"hindsight": False})])
 def test_who_is_told_nothing_learns_nothing(monkeypatch, stage, changes):
     block, _ = struck_block(monkeypatch, stage, **changes)
 

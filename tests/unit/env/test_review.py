@@ -14,7 +14,18 @@ from common.physics.arm import racket_pose
 from common.physics.constants import BALL_RADIUS, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import SIMPLE
 from common.policy.weights import load_policy
-from common.rally.hindsight import BACK, EDGE, FRESH, GOALS, HIT, NEAREST, back_through_drives, hit_result
+from common.rally.hindsight import (
+    BACK,
+    EDGE,
+    FRESH,
+    GOALS,
+    HIT,
+    LEFT_POS,
+    NEAREST,
+    back_through_drives,
+    flies_to,
+    hit_result,
+)
 from common.rally.launch import draw_rallies
 from common.rally.noise import Condition
 from common.rally.trajectory import Outcome, State
@@ -74,9 +85,8 @@ def test_what_is_no_legal_hit_is_not_corrected(state):
     assert step.lessons.rows.size == 0
 
 
-@pytest.mark.parametrize("changes", [{"hindsight": False}, {"collision": "original"}])
-def test_there_is_a_way_to_go_without(changes):
-    env, step = struck(QUIET.model_copy(update=changes))
+def test_there_is_a_way_to_go_without():
+    env, step = struck(QUIET.model_copy(update={"hindsight": False}))
 
     assert step.lessons.rows.size == 0
     assert env.rallies.hit.shape == (0, HIT)
@@ -210,7 +220,7 @@ class Played:
 
     actions: np.ndarray  # (T, B, 7)
     hit_at: np.ndarray  # (B,) step of the hit; -1: none
-    results: np.ndarray  # (B, GOALS) hit_result; nan: no hit
+    results: np.ndarray  # (B, GOALS) hit_result, but landing as the ball left; nan: no hit
     corrections: np.ndarray  # (B, BACK, 7)
     landings: np.ndarray  # (B, 2) of legal landings, else nan
     aims: np.ndarray  # (B, 2) what is aimed at: the target, from inside the edges
@@ -222,11 +232,11 @@ SHAKEN = (
 )
 
 
-def played(actions: np.ndarray | None = None) -> Played:
+def played(actions: np.ndarray | None = None, collision: str = "tailored") -> Played:
     """Play the first ball of each environment by the shipped policy, shaken, or by given actions."""
     policy = load_policy(POLICY)
     seen = policy.contract.observation_options.model_copy(update={"critic": "policy"})
-    config = EnvConfig(observation=seen, go_on=0.0, carry_over=0.0, foresee=1.0)
+    config = EnvConfig(observation=seen, go_on=0.0, carry_over=0.0, foresee=1.0, collision=collision)
     env = RallyEnv(BALLS, config, Deck(draw_rallies(BALLS, seed=1)), stage=3)
     obs, conditions, is_first = env.reset(), env.rallies.condition.copy(), np.ones(BALLS, np.bool_)
     taken, hit_at, rng = [], np.full(BALLS, -1), np.random.default_rng(0)
@@ -241,6 +251,8 @@ def played(actions: np.ndarray | None = None) -> Played:
             hit = env.rallies.hit[b]
             parts = [tuple(hit[i:j]) for i, j in ((9, 16), (16, 23), (0, 3), (3, 6), (6, 9))]
             hit_at[b], results[b] = t, hit_result(*parts, conditions[b], SIMPLE)
+            left = [tuple(hit[i : i + 3]) for i in range(LEFT_POS, HIT, 3)]
+            results[b, :2] = flies_to(*left, conditions[b], SIMPLE)[:2]
         for k, b in enumerate(step.lessons.rows):
             if is_first[b]:
                 found[b] = step.lessons.corrections[k]
@@ -255,28 +267,30 @@ def played(actions: np.ndarray | None = None) -> Played:
 
 
 @cache
-def first_time() -> Played:
-    return played()
+def first_time(collision: str = "tailored") -> Played:
+    return played(collision=collision)
 
 
 @cache
-def corrected() -> Played:
+def corrected(collision: str = "tailored") -> Played:
     """Play the same balls once more, without looking: the same actions, plus the corrections."""
-    before = first_time()
+    before = first_time(collision)
     actions = before.actions.copy()
     for b in np.flatnonzero(before.hit_at >= 0):
         for back in range(BACK):
             actions[before.hit_at[b] - back, b] += before.corrections[b, back]
-    return played(actions)
+    return played(actions, collision)
 
 
-def test_a_hits_result_is_where_the_ball_then_lands():
-    before = first_time()
-    landed = np.isfinite(before.landings[:, 0])
+@pytest.mark.parametrize(("collision", "count", "within"), [("tailored", 50, 0.002), ("original", 15, 0.02)])
+def test_a_hits_result_is_where_the_ball_then_lands(collision, count, within):
+    """Measured: 0.3 mm, by steps of 10 ms against 5 ms and a straight line in the last; 14 mm by MuJoCo's flight."""
+    before = first_time(collision)
+    landed = np.isfinite(before.landings[:, 0]) & (before.hit_at >= 0)
     off = np.linalg.norm(before.results[landed, :2] - before.landings[landed], axis=1)
 
-    assert landed.sum() > 50
-    assert off.max() < 0.002  # steps of 10 ms against 5 ms, and a straight line in the last: measured 0.3 mm
+    assert landed.sum() > count
+    assert off.max() < within
 
 
 def test_the_same_actions_play_the_same_strokes():
@@ -296,6 +310,17 @@ def test_corrected_strokes_land_nearer_to_what_they_aim_at():
     assert both.sum() >= 0.95 * (before.hit_at >= 0).sum() > 110
     assert (is_now < was).mean() > 0.85
     assert is_now.mean() < 0.75 * was.mean()
+
+
+def test_the_simulators_own_contacts_are_corrected_too():
+    """Our racket's law says which way. Measured: 89 % of 108 land nearer, 0.77 m -> 0.64 m, of which .5 m count."""
+    before, after = first_time("original"), corrected("original")
+    both = (before.hit_at >= 0) & (after.hit_at >= 0)
+    was, is_now = (np.linalg.norm(p.results[both, :2] - p.aims[both], axis=1) for p in (before, after))
+
+    assert both.sum() > 90
+    assert (is_now < was).mean() > 0.75
+    assert is_now.mean() < 0.9 * was.mean()
 
 
 def test_corrected_strokes_meet_the_ball_nearer_to_the_rackets_centre():

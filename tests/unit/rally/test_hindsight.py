@@ -23,6 +23,9 @@ from common.rally.hindsight import (
     JOINT_VEL,
     LARGEST_MISS,
     LARGEST_SHORTFALL,
+    LEFT_POS,
+    LEFT_SPIN,
+    LEFT_VEL,
     LEVENBERG,
     MARGIN,
     MOMENT,
@@ -34,9 +37,11 @@ from common.rally.hindsight import (
     TRUST,
     back_through_drives,
     corrections,
+    flies_to,
     hit_result,
     hit_sensitivity,
     least_change,
+    note_leaving,
 )
 from common.rally.noise import CONDITIONS, PROFILES, Condition, draw_conditions
 from tests.unit.rally.scripted import HOME
@@ -80,7 +85,14 @@ def make_hit(seed=0, step=30, off=0.0) -> np.ndarray:
     hit[JOINT_POS : JOINT_POS + 7], hit[JOINT_VEL : JOINT_VEL + 7] = q, rates
     hit[MOMENT], hit[STEP], hit[FRESH] = 0.0133, step, 1.0
     hit[BOUNCE], hit[CONTACT] = 0.2, 0.4
+    leave(hit, make_condition(seed))
     return hit
+
+
+def leave(hit, condition) -> None:
+    """Write the ball as it leaves by our racket's law."""
+    pos, vel, spin, _, _ = bounced(hit, condition)
+    note_leaving(hit, pos, vel, spin)
 
 
 def result_of(hit, condition) -> np.ndarray:
@@ -88,12 +100,12 @@ def result_of(hit, condition) -> np.ndarray:
     return np.array(hit_result(*parts, condition, SIMPLE))
 
 
-def flown(hit, condition) -> np.ndarray:
-    """Return a hit's landing x, y, place on the racket (2), height over the net and delay, slowly."""
+def bounced(hit, condition) -> tuple:
+    """Return the ball as it leaves, its place on the racket (2) and the contact's delay, slowly."""
     q, qd = hit[JOINT_POS : JOINT_POS + 7].copy(), tuple(hit[JOINT_VEL : JOINT_VEL + 7])
     pos, vel, spin = (hit[k : k + 3].copy() for k in (BALL_POS, BALL_VEL, BALL_SPIN))
     # Both move on evenly until they meet: bisection in time
-    low, high = -0.02, 0.02
+    low, high = -0.003, 0.003
     for _ in range(60):
         middle = 0.5 * (low + high)
         gap, _ = racket_gap(tuple(pos + middle * vel), racket_pose(tuple(q + middle * np.array(qd))))
@@ -106,8 +118,13 @@ def flown(hit, condition) -> np.ndarray:
         pose.centre, racket_vel, racket_spin, tuple(pos - BALL_RADIUS * np.array(normal))
     )
     place = [np.dot(pos - pose.centre, axis) for axis in (pose.side, pose.up)]
-    p = tuple(pos)
     v, w = racket_bounce(tuple(vel), tuple(spin), normal, surface_vel, *condition[4:8], np.inf)
+    return tuple(pos), v, w, place, low
+
+
+def flown(hit, condition) -> np.ndarray:
+    """Return a hit's landing x, y, place on the racket (2), height over the net and delay, slowly."""
+    p, v, w, place, later = bounced(hit, condition)
     landing, over, is_down = (np.nan, np.nan), -1.0, False
     for _ in range(6000):
         before = p
@@ -118,7 +135,7 @@ def flown(hit, condition) -> np.ndarray:
             landing, is_down = p[:2], True
         if is_down and (p[0] > 0 or p[2] < -0.7):
             break
-    return np.array([*landing, *place, over, low])
+    return np.array([*landing, *place, over, later])
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -307,7 +324,9 @@ def test_a_correction_reaches_back_to_the_rallys_beginning_at_most():
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e200])
-@pytest.mark.parametrize("column", [BALL_POS, BALL_VEL + 1, BALL_SPIN + 2, JOINT_POS + 3, JOINT_VEL + 6])
+@pytest.mark.parametrize(
+    "column", [LEFT_VEL, BALL_POS, BALL_VEL + 1, BALL_SPIN + 2, JOINT_POS + 3, JOINT_VEL + 6]
+)
 def test_what_isnt_finite_never_leaves(column, wrong):
     hits = np.array([make_hit(0), make_hit(1), make_hit(2)])
     whole, _ = corrected(hits)
@@ -317,6 +336,29 @@ def test_what_isnt_finite_never_leaves(column, wrong):
     assert np.isfinite(found).all()
     assert np.abs(found[steps > 0]).max() <= TRUST
     np.testing.assert_array_equal(found[[0, 2]], whole[[0, 2]])
+
+
+def test_a_correction_goes_by_where_the_ball_went_whatever_our_racket_would_have_done():
+    """A ball that left as if it should land .2 m farther: as if the target were .2 m nearer."""
+    hit, condition = make_hit(0), make_condition(0)
+    condition[[Condition.TARGET_X, Condition.TARGET_Y]] = 0.8, 0.0
+    nearer = condition.copy()
+    nearer[Condition.TARGET_X] -= 0.2
+    left = hit.copy()
+    for _ in range(20):  # Newton's way to the speed that does it
+        x, y, _ = landing_of(left, condition)
+        left[LEFT_VEL] += 2.0 * (landing_of(hit, condition)[0] + 0.2 - x)
+    (far, _), _ = corrected(np.array([left, hit]), np.array([condition, condition]))
+    (short, _), _ = corrected(np.array([hit, hit]), np.array([nearer, nearer]))
+
+    assert y == pytest.approx(landing_of(hit, condition)[1], abs=0.01)
+    np.testing.assert_allclose(far, short, atol=1e-3)  # the faster ball is a little higher over the net, too
+    assert np.abs(far).max() > 0.01
+
+
+def landing_of(hit, condition):
+    left = (tuple(hit[at : at + 3]) for at in (LEFT_POS, LEFT_VEL, LEFT_SPIN))
+    return flies_to(*left, condition, SIMPLE)
 
 
 def test_a_contact_too_soon_after_the_bounce_is_to_come_later_and_only_that():
@@ -337,6 +379,7 @@ def test_a_contact_too_soon_after_the_bounce_is_to_come_later_and_only_that():
 def test_a_correction_asks_for_target_centre_and_where_it_lacks_height_over_the_net(seed, faster, is_low):
     hit, condition = make_hit(seed), make_condition(seed)
     hit[JOINT_VEL] += faster  # the rail towards the net
+    leave(hit, condition)
     by_pos, by_vel, changes = np.empty((GOALS, 7)), np.empty((GOALS, 7)), np.empty((GOALS, BACK, 7))
     x, y, side, up, over, _ = hit_sensitivity(hit, condition, SIMPLE, by_pos, by_vel)
     free, late = np.zeros((BACK, SUBSTEPS, 7), np.bool_), round(condition[Condition.ACTION_LATENCY] / H)
