@@ -6,13 +6,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
+from common.rally.launch_presets import PresetName
 from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
 from services.learner.intake import IntakeConfig
-
-Launch = Literal["paper", "strong", "match"]
 
 
 class DeployConfig(BaseModel):
@@ -48,7 +47,7 @@ class DeployConfig(BaseModel):
     evaluate: bool = Field(True, description="follow the run with an evaluator, and measure the final policy")
     final_rallies: int = Field(1000, ge=1, description="rallies of the final measure")
     seed: int = Field(0, ge=0, lt=2**63, description="of everything random in the run")
-    launch: Launch = Field("paper", description="launch preset of training")
+    launch: PresetName = Field("paper", description="launch preset of training")
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()

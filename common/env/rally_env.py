@@ -49,7 +49,7 @@ class EnvConfig(BaseModel):
     flight: Literal["simple", "full"] = Field("simple", description="aerodynamics of the ball")
     collision: Literal["tailored", "original"] = Field(
         "tailored",
-        description="whose bounces: ours, exact and measured, or MuJoCo's own, ten times slower",
+        description="whose bounces: ours, exact and measured, or MuJoCo's own, half as fast",
     )
     time_limit_s: float = Field(
         2.5, gt=0.1, le=60, description="longest rally; cut, not lost", json_schema_extra={"unit": "s"}

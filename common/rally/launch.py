@@ -144,7 +144,8 @@ def launch(preset: Preset, noise: NoiseProfile, seed: int) -> tuple[Vec, Vec, Ve
         velocity, spin = _stroke(preset, seed)
     else:
         velocity = _drawn(preset.velocity, seed, 3)
-        spin = _ball_spin(preset.spin_radius, seed, 6)
+        mild, strong = preset.spin_radii
+        spin = _ball_spin(mild if uniform(seed, Stream.LAUNCH, 11) < 0.5 else strong, seed, 6)
     drag_factor = between(noise.drag_factor[0], noise.drag_factor[1], seed, Stream.LAUNCH, 9)
     lift_factor = between(noise.lift_factor[0], noise.lift_factor[1], seed, Stream.LAUNCH, 10)
     return position, velocity, spin, drag_factor, lift_factor

@@ -2,7 +2,9 @@
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
+
+PresetName = Literal["paper", "strong", "mixed", "match"]
 
 # A distribution of one quantity: its quantiles at LEVELS, straight lines between, nothing beyond the ends
 Curve = tuple[float, float, float, float, float, float, float]
@@ -24,9 +26,10 @@ class Preset(NamedTuple):
     # polar: speed [m/s], elevation [rad], azimuth [rad] from -x towards y; else v_x, v_y, v_z [m/s]
     velocity: tuple[Curve, Curve, Curve]
     polar: bool
-    # rad/s; topspin, sidespin (about z), corkscrew (about the heading); unused where spin_radius > 0
+    # rad/s; topspin, sidespin (about z), corkscrew (about the heading); unused where spin_radii are
     spin: tuple[Curve, Curve, Curve]
-    spin_radius: float  # rad/s; > 0: spin uniform in a ball of this radius
+    # rad/s; > 0: spin uniform in a ball of one of these radii, either for half of the launches
+    spin_radii: tuple[float, float]
     topspin_by_speed: float  # [-] correlation of topspin with speed (of their normal scores)
 
 
@@ -37,8 +40,10 @@ _PAPER_VELOCITY: Final = (flat(-8.0, -3.0), flat(-4.0, 4.0), flat(-1.0, 1.0))
 PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
     {
         # the paper's box; its authors drew v_x only to -5 m/s and no spin
-        "paper": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _UNUSED, 100.0, 0.0),
-        "strong": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _UNUSED, 300.0, 0.0),
+        "paper": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _UNUSED, (100.0, 100.0), 0.0),
+        "strong": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _UNUSED, (300.0, 300.0), 0.0),
+        # half of each, to train on
+        "mixed": Preset(_PAPER_POSITION, _PAPER_VELOCITY, False, _UNUSED, (100.0, 300.0), 0.0),
         # 609 human shots of elite and professional matches that landed on the robot's side (recordings of
         # Conti et al. 2026): their quantiles at LEVELS
         "match": Preset(
@@ -59,7 +64,7 @@ PRESETS: Final[Mapping[str, Preset]] = MappingProxyType(
                 (-198.0, -122.0, -31.0, 25.0, 92.0, 220.0, 337.0),
                 (-133.0, -85.0, -25.0, 1.0, 26.0, 91.0, 176.0),
             ),
-            spin_radius=0.0,
+            spin_radii=(0.0, 0.0),
             topspin_by_speed=0.75,
         ),
     }

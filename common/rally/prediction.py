@@ -26,9 +26,9 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, BALL_RADIUS
-from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_SLOPE, flight_step
+from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_MAX, SIMPLE_LIFT_SLOPE, flight_step
 from common.physics.table_bounce import table_bounce
-from common.physics.vec import Vec, norm, scale
+from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
 from common.rally.cholesky import factor, inverse, substitute
 
 Array = npt.NDArray[np.float64]
@@ -69,6 +69,9 @@ BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
 # Where lift saturates (at 62 rad/s and 5 m/s) a ball spins faster than its flight shows: so much on average, `paper`
 SATURATED, SATURATED_SIGMA = 1.2, 0.2  # [-] of the spin that the flight shows, and how uncertain that is
 _LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
+_SATURATION = SIMPLE_LIFT_MAX / (
+    SIMPLE_LIFT_SLOPE * BALL_RADIUS
+)  # [1/m] of spin by speed, from which on lift is saturated
 _DRAG_FACTOR = AIR_FACTOR * SIMPLE_DRAG
 _STEP = 0.020  # [s] of the flight that is foretold: Runge-Kutta errs by less than 0.01 mm in it
 _LONGEST = 1.0  # [s] farther ahead nothing is foretold
@@ -116,6 +119,20 @@ def _vec(row: Array, at: int) -> Vec:
 
 
 @kernel
+def _lifting(track: Array, w: Vec) -> Vec:
+    """Return what of a deviation ``w`` from the nominal spin shows in the lift, as unsaturated lift would show it.
+
+    Where the nominal ball's lift is saturated only the spin's direction shows, and the less the faster it spins.
+    """
+    nominal = _vec(track, NOMINAL_SPIN)
+    rate, most = norm(nominal), _SATURATION * norm(_vec(track, VEL))
+    if rate <= most:
+        return w
+    along = dot(nominal, w) / (rate * rate)
+    return scale(most / rate, axpy(-along, nominal, w))
+
+
+@kernel
 def _advance(track: Array, h: float) -> None:
     """Fly the nominal ball ``h`` seconds on, with all that is summed along it."""
     v = _vec(track, VEL)
@@ -145,17 +162,18 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
     position, velocity = max(position_noise, LEAST_POSITION_NOISE), max(velocity_noise, LEAST_VELOCITY_NOISE)
     row = np.empty(UNKNOWNS)
     for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3  # (w x X)_k = w_i X_j - w_j X_i
+        axis = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
         row[:] = 0.0
         row[k], row[_DV + k] = 1.0, track[LEFT_PATH]
-        row[_SPIN + i] = _LIFT * SPIN_SIGMA * track[PATH + j]
-        row[_SPIN + j] = -_LIFT * SPIN_SIGMA * track[PATH + i]
+        # (w x X)_k = w . (X x e_k); what shows of w is a symmetric map of it
+        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(_vec(track, PATH), axis)))
+        row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED_PATH + k]
         _weigh_in(track, row, seen[k] - track[POS + k], position)
         row[:] = 0.0
         row[_DV + k] = track[LEFT]
-        row[_SPIN + i] = _LIFT * SPIN_SIGMA * track[WAY + j]
-        row[_SPIN + j] = -_LIFT * SPIN_SIGMA * track[WAY + i]
+        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(_vec(track, WAY), axis)))
+        row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED + k]
         _weigh_in(track, row, seen[3 + k] - track[VEL + k], velocity)
     lower = np.empty((UNKNOWNS, UNKNOWNS))
@@ -167,30 +185,14 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
 def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
     """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
     found = track[FOUND:NORMAL]
-    dw = (SPIN_SIGMA * found[_SPIN], SPIN_SIGMA * found[_SPIN + 1], SPIN_SIGMA * found[_SPIN + 2])
+    dw = scale(SPIN_SIGMA, _vec(found, _SPIN))
+    lifting = scale(_LIFT, _lifting(track, dw))
     k = DRAG_SIGMA * found[_DRAG]
-    x, w = _vec(track, PATH), _vec(track, WAY)
-    turned = (dw[1] * x[2] - dw[2] * x[1], dw[2] * x[0] - dw[0] * x[2], dw[0] * x[1] - dw[1] * x[0])
-    bent = (dw[1] * w[2] - dw[2] * w[1], dw[2] * w[0] - dw[0] * w[2], dw[0] * w[1] - dw[1] * w[0])
-    pos = (
-        track[POS] + found[0] + track[LEFT_PATH] * found[3] + _LIFT * turned[0] + k * track[SLOWED_PATH],
-        track[POS + 1]
-        + found[1]
-        + track[LEFT_PATH] * found[4]
-        + _LIFT * turned[1]
-        + k * track[SLOWED_PATH + 1],
-        track[POS + 2]
-        + found[2]
-        + track[LEFT_PATH] * found[5]
-        + _LIFT * turned[2]
-        + k * track[SLOWED_PATH + 2],
-    )
-    vel = (
-        track[VEL] + track[LEFT] * found[3] + _LIFT * bent[0] + k * track[SLOWED],
-        track[VEL + 1] + track[LEFT] * found[4] + _LIFT * bent[1] + k * track[SLOWED + 1],
-        track[VEL + 2] + track[LEFT] * found[5] + _LIFT * bent[2] + k * track[SLOWED + 2],
-    )
-    spin = (track[NOMINAL_SPIN] + dw[0], track[NOMINAL_SPIN + 1] + dw[1], track[NOMINAL_SPIN + 2] + dw[2])
+    pos = add(_vec(track, POS), axpy(track[LEFT_PATH], _vec(found, _DV), _vec(found, 0)))
+    pos = axpy(k, _vec(track, SLOWED_PATH), add(pos, cross(lifting, _vec(track, PATH))))
+    vel = axpy(track[LEFT], _vec(found, _DV), _vec(track, VEL))
+    vel = axpy(k, _vec(track, SLOWED), add(vel, cross(lifting, _vec(track, WAY))))
+    spin = add(_vec(track, NOMINAL_SPIN), dw)
     # Bad samples must not send the prediction beyond all bounds
     spin = scale(min(1.0, MOST_SPIN / max(norm(spin), 1.0)), spin)
     return pos, vel, spin, min(max(track[NOMINAL_DRAG] + k, 1.0 - MOST_DRAG), 1.0 + MOST_DRAG)
@@ -229,16 +231,22 @@ def _fly(pos: Vec, vel: Vec, spin: Vec, drag: float, duration: float) -> tuple[V
 
 
 @kernel
-def _through_bounce(track: Array, vel: Vec, spin: Vec, covariance: Array) -> tuple[Vec, Vec]:
-    """Return velocity and spin to be expected behind the bounce, and write their covariance (6, 6)."""
-    lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
-    factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
-    inverse(lower, variance)
+def _through_bounce(vel: Vec, shown: Vec, variance: Array, covariance: Array) -> tuple[Vec, Vec]:
+    """Return velocity and spin to be expected behind the bounce, and write their covariance (6, 6).
+
+    Args:
+        vel: Velocity before it [m/s].
+        shown: Spin before it, as the flight shows it [rad/s].
+        variance: Of the fit's unknowns (10, 10).
+        covariance: Written.
+    """
+    spin = scale(SATURATED, shown)
     square, spread = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
-            square[i, j] = (
-                SPIN_SIGMA**2 * variance[_SPIN + i, _SPIN + j] + SATURATED_SIGMA**2 * spin[i] * spin[j]
+            fit = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN + i, _SPIN + j]
+            square[i, j] = SATURATED * SATURATED * fit + SATURATED_SIGMA * SATURATED_SIGMA * (
+                fit + shown[i] * shown[j]
             )
     factor(square, spread)
     points = np.empty((10, 6))
@@ -272,10 +280,17 @@ def _through_bounce(track: Array, vel: Vec, spin: Vec, covariance: Array) -> tup
 
 
 @kernel
-def _begin_anew(track: Array, moment: float, pos: Vec, vel: Vec, spin: Vec, covariance: Array) -> None:
+def _begin_anew(
+    track: Array,
+    moment: float,
+    pos: Vec,
+    vel: Vec,
+    spin: Vec,
+    covariance: Array,
+    drag: float,
+    drag_variance: float,
+) -> None:
     """Let the fit begin at the bounce, with what was known of it as its prior."""
-    drag = track[NOMINAL_DRAG] + DRAG_SIGMA * track[FOUND + _DRAG]
-    information = track[NORMAL + UNKNOWNS * UNKNOWNS - 1]
     lower, weight = np.empty((6, 6)), np.empty((6, 6))
     factor(covariance, lower)
     inverse(lower, weight)
@@ -291,7 +306,7 @@ def _begin_anew(track: Array, moment: float, pos: Vec, vel: Vec, spin: Vec, cova
         for j in range(i + 1):
             unit = (SPIN_SIGMA if i >= 3 else 1.0) * (SPIN_SIGMA if j >= 3 else 1.0)
             track[NORMAL + (_DV + i) * UNKNOWNS + _DV + j] = unit * weight[i, j]
-    track[NORMAL + UNKNOWNS * UNKNOWNS - 1] = information
+    track[NORMAL + UNKNOWNS * UNKNOWNS - 1] = 1.0 / drag_variance
     track[BOUNCED] = 1.0
 
 
@@ -315,13 +330,21 @@ def follow(
         pos, vel, spin, drag = _estimate(track)
         wait, there, then = _to_table(pos, vel, spin, drag)
         at = track[MOMENT] + wait
-        if abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0:  # believe the sample then
-            at, there = moment, (seen[0], seen[1], seen[2])
+        lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+        factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
+        inverse(lower, variance)
+        surprises = abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0
+        if surprises:
             then = (seen[3], seen[4], -abs(seen[5]))
-        spin = scale(SATURATED, spin)
         covariance = np.empty((6, 6))
-        vel, spin = _through_bounce(track, then, spin, covariance)
-        _begin_anew(track, at, there, vel, spin, covariance)
+        vel, spin = _through_bounce(then, spin, variance, covariance)
+        if surprises:  # where and how fast the ball is is what the sample says
+            at, there, vel = moment, _vec(seen, 0), _vec(seen, 3)
+            covariance[:3] = 0.0
+            covariance[:, :3] = 0.0
+            for k in range(3):
+                covariance[k, k] = max(velocity_noise, LEAST_VELOCITY_NOISE) ** 2
+        _begin_anew(track, at, there, vel, spin, covariance, drag, variance[_DRAG, _DRAG])
     _take(track, seen, moment, position_noise, velocity_noise)
 
 
@@ -334,11 +357,11 @@ def predict(track: Array, now: float) -> None:
     here, speed = pos, vel
     if track[BOUNCED] == 0.0:
         wait, there, then = _to_table(pos, vel, spin, drag)
-        if wait > _LONGEST:  # a ball that doesn't come down on the robot's side, as far as is known
-            until, ahead = 0.0, min(ahead, _LONGEST)
+        if ahead < wait:
+            here, speed = _fly(pos, vel, spin, drag, min(ahead, _LONGEST))
+        if wait > _LONGEST:  # not down so soon: as far as is foretold
+            until = _LONGEST
         else:
-            if ahead < wait:
-                here, speed = _fly(pos, vel, spin, drag, ahead)
             flat = (then[0], then[1], min(then[2], -0.1))
             pos = there
             vel, spin = table_bounce(

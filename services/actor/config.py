@@ -6,6 +6,7 @@ from pydantic import Field
 
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
+from common.rally.launch_presets import PresetName
 from common.service_config import ServiceConfig
 from services.actor.outbox import OutboxConfig
 
@@ -16,9 +17,7 @@ class ActorConfig(ServiceConfig):
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
     outbox: OutboxConfig = OutboxConfig()
-    launch: Literal["paper", "strong", "match"] = Field(
-        "paper", description="launch preset, as the generators'"
-    )
+    launch: PresetName = Field("paper", description="launch preset, as the generators'")
     envs: int = Field(256, ge=1, le=65536, description="environments played together")
     horizon: int = Field(32, ge=1, le=4096, description="control steps of one rollout")
     index: int = Field(

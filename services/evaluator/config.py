@@ -6,6 +6,7 @@ from pydantic import Field
 
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
+from common.rally.launch_presets import PresetName
 from common.service_config import ServiceConfig
 
 
@@ -19,7 +20,7 @@ class EvaluatorConfig(ServiceConfig):
     rallies: int = Field(
         1000, ge=1, le=1_000_000, description="rallies to play; in following, of each evaluation"
     )
-    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     envs: int = Field(250, ge=1, le=65536, description="environments played together")

@@ -13,6 +13,7 @@ from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE
+from common.rally.launch_presets import PresetName
 from common.render.rally_recorder import record
 from common.render.stills import rally_picture, rally_strip, save_png, showpiece
 from services.evaluator.match import evaluation_rallies
@@ -36,7 +37,7 @@ class PicturesConfig(BaseModel):
     )
     out: str = Field("docs/pictures", description="folder to write rally.png and strip.png into")
     rallies: int = Field(40, ge=1, le=1000, description="rallies to choose from")
-    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
     camera: Literal["side", "behind", "target", "follow"] = Field("side", description="where it is seen from")

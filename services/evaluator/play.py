@@ -13,6 +13,7 @@ from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE
+from common.rally.launch_presets import PresetName
 from common.render.film import check_tools
 from common.render.rally_recorder import record
 from common.run_folder import LATEST, RunFolder
@@ -33,7 +34,7 @@ class PlayConfig(FilmConfig):
     video: str = Field("runs/play.mp4", pattern=r"\.mp4$", description="film to write, H.264")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to measure on")
     film_rallies: int = Field(8, ge=0, le=200, description="rallies to film, the first ones; 0: no film")
-    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")

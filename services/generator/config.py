@@ -4,13 +4,14 @@ from typing import Literal
 
 from pydantic import Field
 
+from common.rally.launch_presets import PresetName
 from common.service_config import ServiceConfig
 
 
 class GeneratorConfig(ServiceConfig):
     """Settings of a generator: which rallies, how many, to which shards."""
 
-    launch: Literal["paper", "strong", "match"] = Field("paper", description="launch preset")
+    launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field(
         "standard", description="how far drag and lift are drawn"
     )

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
+from common.rally.launch_presets import PresetName
 from common.service_config import ServiceConfig
 from services.learner.curriculum import CurriculumConfig
 from services.learner.guard import GuardConfig
@@ -25,9 +26,7 @@ class LearnerConfig(ServiceConfig):
     curriculum: CurriculumConfig = CurriculumConfig()
     guard: GuardConfig = GuardConfig()
     intake: IntakeConfig = IntakeConfig()
-    launch: Literal["paper", "strong", "match"] = Field(
-        "paper", description="launch preset, as the generators'"
-    )
+    launch: PresetName = Field("paper", description="launch preset, as the generators'")
     folder: str = Field("", description="run folder; empty: runs/RUN")
     resume: bool = Field(False, description="go on from the newest checkpoint in the run folder")
     minutes: float = Field(

@@ -104,7 +104,7 @@ def test_gaps_and_repeats_are_counted_by_source():
     assert (buffer.counts.gaps, buffer.counts.repeated, buffer.counts.received) == (2, 2, 5)
 
 
-@pytest.mark.parametrize("preset", ["paper", "strong", "match"])
+@pytest.mark.parametrize("preset", PRESETS)
 def test_what_generators_draw_passes_and_what_no_launch_can_be_does_not(preset):
     block = draw_rallies(200, seed=1, preset=preset, noise="hard")
     batch = make_batch(count=200, rallies=block.launches, seeds=block.seeds)

@@ -15,6 +15,7 @@ from common.rally.prediction import (
     FOUND,
     MEETING,
     MEETING_AFTER,
+    NOMINAL_DRAG,
     PRESENT,
     SATURATED,
     SATURATED_SIGMA,
@@ -176,16 +177,17 @@ def test_the_prior_behind_the_bounce_is_a_monte_carlos(spin):
     track = tracked(samples(spin, moments, noise=NOISE), moments, NOISE)
     normal = track[FOUND + 10 : FOUND + 110].reshape(10, 10)
     normal = np.tril(normal) + np.tril(normal, -1).T
-    spread = SPIN_SIGMA**2 * np.linalg.inv(normal)[6:9, 6:9]
-    mean = SATURATED * SPIN_SIGMA * track[FLIGHT_SPIN]
-    spread += SATURATED_SIGMA**2 * np.outer(mean, mean)
+    variance = np.linalg.inv(normal)
+    shown = SPIN_SIGMA * track[FLIGHT_SPIN]
     _, _, vel = bounce_of(spin)
     rng = np.random.default_rng(0)
+    spins = rng.multivariate_normal(shown, SPIN_SIGMA**2 * variance[6:9, 6:9], 20_000)
+    spins *= rng.normal(SATURATED, SATURATED_SIGMA, (20_000, 1))
     after = np.array(
         [
             np.concatenate(table_bounce(vel, tuple(turned), UP, restitution, friction))
             for turned, restitution, friction in zip(
-                rng.multivariate_normal(mean, spread, 20_000),
+                spins,
                 rng.normal(0.975, 0.0144, 20_000),
                 rng.normal(0.25, 0.029, 20_000),
                 strict=True,
@@ -193,7 +195,7 @@ def test_the_prior_behind_the_bounce_is_a_monte_carlos(spin):
         ]
     )
     covariance = np.empty((6, 6))
-    expected = np.concatenate(prediction._through_bounce(track, vel, tuple(mean), covariance))
+    expected = np.concatenate(prediction._through_bounce(vel, tuple(shown), variance, covariance))
     covariance -= np.diag([prediction.BOUNCE_SPEED_SIGMA**2] * 3 + [prediction.BOUNCE_SPIN_SIGMA**2] * 3)
     sigma = after.std(axis=0)
 
@@ -267,7 +269,36 @@ def test_a_bounce_that_was_not_foreseen_is_believed():
     predict(track, 0.12)
 
     np.testing.assert_allclose(track[HERE], [-0.3, 0.5, 0.05], atol=0.01)
+    np.testing.assert_allclose(track[GOING], [-2.0, 0.5, 2.0], atol=1e-6)
     assert track[BOUNCED] == 1.0
+
+
+def test_what_was_known_of_drag_before_the_bounce_is_known_behind_it_and_no_more():
+    moments = np.arange(0, 0.3, 0.02)
+    seen = samples((5.0, -40.0, 20.0), moments, drag=1.1, noise=NOISE)
+    track = tracked(seen, moments, NOISE)
+    normal = track[FOUND + 10 : FOUND + 110].reshape(10, 10)
+    known = 1.0 / np.linalg.inv(np.tril(normal) + np.tril(normal, -1).T)[9, 9]
+    moment, place, falling = bounce_of((5.0, -40.0, 20.0))
+    rising, _ = table_bounce(falling, (5.0, -40.0, 20.0), UP, 0.975, 0.25)
+    follow(track, np.array([*place, *rising]), moment + 1e-3, True, *NOISE)
+
+    assert track[FOUND + 109] == pytest.approx(known, rel=0.01)
+
+
+def test_of_a_lob_the_present_is_foretold_and_the_meeting_is_a_second_off():
+    """It stays up for longer than anything is foretold."""
+    lob = (-0.5, 0.1, 6.0)
+    moments = np.arange(0, 0.1, 0.02)
+    track = tracked(samples((0.0, 0.0, 0.0), moments, vel=lob), moments)
+    predict(track, 0.12)
+    here, going = flown((0.0, 0.0, 0.0), 0.12, vel=lob)
+
+    np.testing.assert_allclose(track[HERE], here, atol=0.005)
+    np.testing.assert_allclose(track[GOING], going, atol=0.03)
+    there, _ = flown((0.0, 0.0, 0.0), 1.08, vel=lob)
+    assert track[MEETING] == pytest.approx(0.96)
+    np.testing.assert_allclose(track[MET], there, atol=0.02)
 
 
 @pytest.mark.parametrize("vertical", [-3.0, 0.0, 2.0])
@@ -279,6 +310,12 @@ def test_a_single_wild_sample_leads_to_no_wild_prediction(height, vertical):
     predict(track, 0.045)
 
     assert np.isfinite(track).all()
+    assert np.abs(track[PRESENT:]).max() < 1500.0
+    follow(track, np.array([0.5, 0.3, 0.1, -5.0, 0.0, 2.0]), 0.06, True, *NOISE)
+    predict(track, 0.08)
+
+    assert np.isfinite(track).all()
+    assert 0.5 <= track[NOMINAL_DRAG] <= 1.5
     assert np.abs(track[PRESENT:]).max() < 1500.0
 
 
