@@ -13,7 +13,7 @@ an unknown variable in silence, and can't tell where a bad value came from.
 import difflib
 import os
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -74,6 +74,7 @@ def load(
     prog: str,
     section: str,
     environ: Mapping[str, str] | None = None,
+    elsewhere: Callable[[Iterable[str]], Mapping[str, str]] = lambda _: {},
 ) -> _Model:
     """Return the settings of one service.
 
@@ -83,6 +84,7 @@ def load(
         prog: How the program is called, for the help text.
         section: The service's table in the file and its part of the environment's names.
         environ: Environment; the process's by default.
+        elsewhere: Of all dotted paths, those that are no flags, and which flag to give instead ("": none).
 
     Raises:
         ConfigError: An unknown or unusable setting.
@@ -90,7 +92,7 @@ def load(
     """
     environ = os.environ if environ is None else environ
     settings = settings_of(model)
-    flags, file = _read_flags(argv, model, settings, prog, section)
+    flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings))
     environment = _read_environment(environ, settings, section)
     file = file or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
     layers = (
@@ -137,9 +139,15 @@ def _nested_defaults(settings: Mapping[str, Setting]) -> _Layer:
 
 
 def _read_flags(
-    argv: Sequence[str], model: type[BaseModel], settings: Mapping[str, Setting], prog: str, section: str
+    argv: Sequence[str],
+    model: type[BaseModel],
+    settings: Mapping[str, Setting],
+    prog: str,
+    section: str,
+    elsewhere: Mapping[str, str],
 ) -> tuple[_Layer, str]:
     """Return what the flags set, and the file they name."""
+    settings = {path: setting for path, setting in settings.items() if path not in elsewhere}
     layer, file = _Layer(), ""
     words = list(argv)
     while words:
@@ -151,6 +159,9 @@ def _read_flags(
         name, equals, value = word[2:].partition("=")
         path = name.replace("-", "_")
         setting = settings.get(path)
+        if path in elsewhere:
+            instead = f"give --{flag_of(elsewhere[path])}" if elsewhere[path] else "the run sets it"
+            raise ConfigError(f"--{name} can't be set for one service: {instead}")
         if setting is None and path != "config":
             flags = [f"--{flag_of(known)}" for known in settings]
             raise ConfigError(f"unknown flag --{name}{_suggestion(f'--{name}', flags)}")

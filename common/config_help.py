@@ -1,5 +1,6 @@
 """What there is to set, as a model declares it: type, unit, range and default of each field, for people."""
 
+import inspect
 import json
 import types
 import typing
@@ -86,20 +87,23 @@ def format_help(prog: str, model: type[BaseModel], settings: Mapping[str, Settin
     """Return the text of ``--help``: a line per setting with unit, range and default."""
     rows = [(f"--{path.replace('_', '-')}", setting) for path, setting in settings.items()]
     width = max((len(flag) for flag, _ in rows), default=0)
-    purpose = (model.__doc__ or "").strip().splitlines()
-    lines = [f"usage: {prog} [--config FILE] [--NAME VALUE ...]", "", *purpose[:1], ""]
+    purpose = inspect.cleandoc(model.__doc__ or "").splitlines()
+    lines = [f"usage: {prog} [--config FILE] [--NAME VALUE ...]", "", *purpose, ""]
     lines.append(f"  {'--config':{width}}  TOML file with a table [{section}]")
     for flag, setting in rows:
         unit = f" [{setting.unit}]" if setting.unit else ""
         details = f"{setting.allowed}; default {_shown(setting.default)}"
         lines.append(f"  {flag:{width}}  {setting.description}{unit} ({details})")
+    example = next((path for path in settings if "." in path), next(iter(settings), "name"))
+    variable = f"TOPSPIN_{section.upper()}__{example.upper().replace('.', '__')}"
     lines += [
         "",
-        "Flags beat the environment, the environment beats the file. There --ppo.clip is called",
-        f"TOPSPIN_{section.upper()}__PPO__CLIP; what all services share goes without their names too:",
-        ", ".join(f"TOPSPIN_{path.upper()}" for path, setting in settings.items() if setting.is_shared)
-        or "none",
+        "Flags beat the environment, the environment beats the file. In the environment "
+        f"--{example.replace('_', '-')} is called {variable}.",
     ]
+    shared = ", ".join(f"TOPSPIN_{path.upper()}" for path, setting in settings.items() if setting.is_shared)
+    if shared:
+        lines += ["Some go without the first name too:", shared]
     return "\n".join(lines) + "\n"
 
 

@@ -1,6 +1,7 @@
 """Settings of a whole run on one machine: every process's, and how many there are."""
 
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -24,8 +25,9 @@ class DeployConfig(BaseModel):
         1,
         ge=1,
         le=1000,
-        description="actor processes; they share 256 environments, or have --actor.envs each. The learner keeps a "
-        "core busy of its own",
+        description="actor processes; they share 256 environments (16 each at least: more than 16 actors make larger "
+        "datasets, and the stages, which count datasets, longer), or have --actor.envs each. The learner keeps a core "
+        "busy of its own",
     )
     generators: int = Field(1, ge=1, le=100, description="generator processes")
     shards: int = Field(0, ge=0, le=4096, description="rally shards; 0: as many as actors")
@@ -63,15 +65,42 @@ FEWEST_ENVS = 16
 def shared_out(config: DeployConfig) -> DeployConfig:
     """Return ``config`` with its datasets made of one rollout of each actor, which share one actor's environments.
 
-    So a dataset is as large with any number of them. What was asked for, other than what is usual, stays.
+    So a dataset is as large with up to 16 of them. What was asked for, other than what is usual, stays.
     """
     actor, learner, intake = config.actor, config.learner, config.learner.intake
     if actor.envs == ENVS:
         actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
     if intake.dataset_rollouts == ROLLOUTS:
-        intake = intake.model_copy(update={"dataset_rollouts": config.actors})
+        queue = max(intake.queue_rollouts, 2 * config.actors)
+        intake = intake.model_copy(update={"dataset_rollouts": config.actors, "queue_rollouts": queue})
     learner = learner.model_copy(update={"intake": intake})
     return config.model_copy(update={"actor": actor, "learner": learner})
+
+
+HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
+    "learner": {name: name for name in ("launch", "env", "network", "minutes", "frames", "folder", "mode")},
+    "actor": {name: name for name in ("launch", "env", "network", "shards", "id", "index")},
+    "generator": {
+        "launch": "launch", "noise": "env.noise", "flight": "env.flight", "shards": "shards", "of": "generators",
+        "id": "id", "index": "index",
+    },
+    "evaluator": {"launch": "launch", "env": "env", "network": "network", "noise": "env.noise", "folder": "folder"},
+}  # fmt: skip
+"""What a service is told by the run, and which of the run's settings says it; some, only the run knows."""
+_TO_ALL: Final = ("run", "endpoint", "seed")
+
+
+def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
+    """Return those dotted paths of a run's settings that are handed down, and what to set instead ("": nothing)."""
+    found = {}
+    for path in paths:
+        role, _, rest = path.partition(".")
+        name, _, inner = rest.partition(".")
+        source = name if name in _TO_ALL else HANDED_DOWN.get(role, {}).get(name)
+        if role in HANDED_DOWN and source is not None:
+            known = source.partition(".")[0] in DeployConfig.model_fields
+            found[path] = f"{source}.{inner}".rstrip(".") if known else ""
+    return found
 
 
 def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str) -> dict[str, dict[str, Any]]:

@@ -31,7 +31,7 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
 from common.run_folder import LATEST, RUNS, RunFolder
-from deploy.config import DeployConfig, service_sections, shared_out
+from deploy.config import DeployConfig, given_elsewhere, service_sections, shared_out
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
 
@@ -98,7 +98,7 @@ def free_endpoint() -> str:
 
 def settings(argv: Sequence[str]) -> DeployConfig:
     """Return the settings of a run; a resumed one has those of its config.toml, but for the flags given now."""
-    config = load(DeployConfig, argv, prog=PROG, section="local")
+    config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
     if not config.resume:
         if config.run == LATEST:
             raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
@@ -111,7 +111,8 @@ def settings(argv: Sequence[str]) -> DeployConfig:
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
     if not any(word.split("=")[0] == "--config" for word in argv):
-        config = load(DeployConfig, [*argv, "--config", str(file)], prog=PROG, section="local")
+        argv = [*argv, "--config", str(file)]
+        config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
     return config.model_copy(update={"run": name})
 
 

@@ -161,7 +161,7 @@ class Rollout:
     rally_flags: Annotated[U8, Wire("bits", "|u1", "T B", low=0, high=UNVALIDATED)]
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
-    # What the actions before a hit should have differed by (hindsight.correction); 0 where nothing is known
+    # What the actions before a hit should have differed by (hindsight.correction); rows of zeros: nothing is known
     corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 

@@ -2,9 +2,9 @@
 
 For comparison with the tailored collisions (the paper's Policy 3). Rules, reward, noise of camera and drives, and
 the air are the same; restitution and friction are MuJoCo's and don't vary from rally to rally. The air's force is
-the tailored flight's acceleration, renewed on the same 5 ms grid and held in between: a control step is a few short
-rollouts, never a loop over environments. Contacts need a short time step, and are rare: on each piece of the grid
-balls with an obstacle within reach are stepped finely, the others take it in one step.
+the tailored flight's acceleration, held in between: a control step is a few short rollouts, never a loop over
+environments. Contacts need a short time step, and are rare: on each piece of the flight's grid (5 ms) balls with an
+obstacle within reach are stepped finely, the air's force renewed every millisecond, and the others take it in one step.
 
 A touch is the first substep in which MuJoCo reports a contact with an obstacle that the ball was free of. MuJoCo's
 contacts are springs: one lasts some substeps, and the ball sinks in by up to 0.45 mm per m/s at the racket. The
@@ -41,9 +41,12 @@ Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 STEP = 0.0005  # [s] at 1 ms a fast ball meets the racket in a single step, and its restitution is chance
-SUBSTEPS = round(GRID_STEP / STEP)  # of one rollout: the air's force is held
+SUBSTEPS = round(GRID_STEP / STEP)  # of a piece of the grid
+AIR_SUBSTEPS = (
+    2  # that the air's force is held for; for 5 ms, a hit ball would be drawn by the air that met it
+)
 CLEARANCE = 0.010  # [m] MuJoCo's beam has corners, 8 mm beyond ours
-SPEEDING_UP = 3.0  # [m/s] by which ball and robot together close faster at the end of 5 ms, at most
+SPEEDING_UP = 3.0  # [m/s] by which they close faster than now over 5 ms: 1.8 with all drives at their limits
 FREE_SUBSTEPS = 4  # a contact that reopens within 2 ms is still the same one
 
 
@@ -144,9 +147,9 @@ def _turned(turn: Array, a: Vec) -> Vec:
 
 
 @kernel
-def _blow(qpos: Array, qvel: Array, condition: Array, model: int, force: Array) -> None:
-    """Write the air's force [N] on each ball (B, 6)."""
-    for b in range(qpos.shape[0]):
+def _blow(qpos: Array, qvel: Array, condition: Array, rows: Rows, model: int, force: Array) -> None:
+    """Write the air's force [N] on the balls of ``rows`` into theirs of (B, 6)."""
+    for b in rows:
         v, w = qvel[b, _BALL_VEL:], qvel[b, _BALL_SPIN:]
         spin = _turned(qpos[b, _BALL_TURN:], (w[0], w[1], w[2]))
         a = acceleration((v[0], v[1], v[2]), spin, condition[b, 0], condition[b, 1], model)
@@ -156,9 +159,9 @@ def _blow(qpos: Array, qvel: Array, condition: Array, model: int, force: Array) 
 
 @kernel
 def _closes(gap: float, normal: Vec, vel: Vec, robot_speed: float) -> bool:
-    """Return whether a gap to something convex may close before the grid's next point.
+    """Return whether a gap may close before the grid's next point.
 
-    Such a gap is a convex function of the ball's position: it grows by no less than its slope says.
+    To something convex it is a convex function of the ball's position: it grows by no less than its slope says.
     """
     closing = max(robot_speed - dot(normal, vel), 0.0) + SPEEDING_UP
     return gap < CLEARANCE + GRID_STEP * closing
@@ -174,7 +177,7 @@ def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
         path: Scratch (2, 7).
         out: (B,); written.
     """
-    still = (0.0, 0.0, 0.0)
+    no_normal = (0.0, 0.0, 0.0)
     for b in range(qpos.shape[0]):
         p, v = qpos[b, _BALL_POS:], qvel[b, _BALL_VEL:]
         pos, vel = (p[0], p[1], p[2]), (v[0], v[1], v[2])
@@ -190,11 +193,12 @@ def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
             path[0, j], path[1, j] = qpos[b, j], qpos[b, j] + GRID_STEP * qvel[b, j]
         speed = speed_bound(path, GRID_STEP)
         q = joints_at(path, 0.0, GRID_STEP)
-        if out[b] or not _closes(touch.robot_gap_bound(pos, q), still, vel, norm(vel) + speed):
+        anywhere = norm(vel) + speed  # no slope to go by: the arm isn't convex
+        if out[b] or not _closes(touch.robot_gap_bound(pos, q), no_normal, vel, anywhere):
             continue
         racket, on_racket = touch.racket_gap(pos, racket_pose(q))
-        body, on_body = touch.body_gap(pos, q)
-        out[b] = _closes(racket, on_racket, vel, speed) or _closes(body, on_body, vel, speed)
+        body = touch.body_gap(pos, q)[0]
+        out[b] = _closes(racket, on_racket, vel, speed) or _closes(body, no_normal, vel, anywhere)
 
 
 def _line(start: Array, end: Array) -> Array:
@@ -241,18 +245,19 @@ class RobotAndBall(RobotBatch):
 
     def _advance(self, control: Array) -> dict[str, Array]:
         for first in range(0, self.substeps, SUBSTEPS):
-            _blow(self.qpos, self.qvel, self.condition, self._flight_model, self.ball_force)
             _within_reach(self.qpos, self.qvel, self._path, self._is_near)
             part = slice(first, first + SUBSTEPS)
             near, far = np.flatnonzero(self._is_near), np.flatnonzero(~self._is_near)
-            if near.size:
-                self._record(near, part, self._roll_out(near, STEP, control[near, part]))
+            for k in range(first, part.stop if near.size else first, AIR_SUBSTEPS):
+                piece = slice(k, k + AIR_SUBSTEPS)
+                self._record(near, piece, self._roll_out(near, STEP, control[near, piece]))
             if far.size:
-                self._record(far, part, self._stride(far, control[far, first : first + 1]))
+                self._record(far, part, self._stride(far, control[far, part].mean(axis=1, keepdims=True)))
         return self._records
 
     def _roll_out(self, rows: Rows, step: float, control: Array) -> dict[str, Array]:
-        """Return records (n, m, ...) of MuJoCo's steps of ``step`` seconds under controls (n, m, 7)."""
+        """Return records (n, m, ...) of MuJoCo's steps of ``step`` seconds in this air, under controls (n, m, 7)."""
+        _blow(self.qpos, self.qvel, self.condition, rows, self._flight_model, self.ball_force)
         self._time_step[rows] = step
         played: dict[str, Array] = self.batch.rollout(
             control.shape[1],
@@ -264,7 +269,7 @@ class RobotAndBall(RobotBatch):
         return played
 
     def _stride(self, rows: Rows, control: Array) -> dict[str, Array]:
-        """Return records as of fine steps, of one step to the grid's next point."""
+        """Return records of one step to the grid's next point, under controls (n, 1, 7), as of fine ones: on a line."""
         start = {"qpos": self.qpos[rows], "qvel": self.qvel[rows]}
         played = self._roll_out(rows, GRID_STEP, control)
         # MuJoCo moves by the velocity at a step's end: under an acceleration a it is ahead by a h^2 / 2

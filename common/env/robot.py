@@ -171,7 +171,7 @@ class RobotBatch:
         self._held[0] = target
         r = self._records = self._advance(self._control)
         # MuJoCo resets a simulation that meets NaN or huge numbers: its time starts at 0 again.
-        behind = _UNDER_WAY + self.substeps * self.step_s - self._time.reshape(-1)
+        behind = _UNDER_WAY + self.substeps * self.step_s - self._time
         self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
         if self.faulty.size:
             self._recover(self.faulty)

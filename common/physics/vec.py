@@ -2,9 +2,18 @@
 
 import math
 
+import numpy as np
+import numpy.typing as npt
+
 from common.jit import kernel
 
 Vec = tuple[float, float, float]
+
+
+@kernel
+def vec_at(row: npt.NDArray[np.float64], at: int) -> Vec:
+    """Return the vector in columns ``at``, ``at + 1``, ``at + 2`` of a row."""
+    return (row[at], row[at + 1], row[at + 2])
 
 
 @kernel

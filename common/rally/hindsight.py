@@ -29,7 +29,7 @@ from common.physics.constants import BALL_RADIUS, NET_HEIGHT, TABLE_HALF_LENGTH,
 from common.physics.flight import flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
-from common.physics.vec import Vec, axpy, dot, sub
+from common.physics.vec import Vec, axpy, dot, sub, vec_at
 from common.rally.cholesky import factor, substitute
 from common.rally.heading import LONGEST_RETURN, NOT_THAT_FAR
 
@@ -199,11 +199,6 @@ def _joints(hit: Array, at: int) -> Joints:
 
 
 @kernel
-def _vec(hit: Array, at: int) -> Vec:
-    return (hit[at], hit[at + 1], hit[at + 2])
-
-
-@kernel
 def hit_sensitivity(
     hit: Array, condition: Array, model: int, by_pos: Array, by_vel: Array
 ) -> tuple[float, float, float, float, float, float]:
@@ -216,7 +211,7 @@ def hit_sensitivity(
         by_pos: (GOALS, 7) d result / d joint position; written.
         by_vel: (GOALS, 7) d result / d joint velocity; written.
     """
-    pos, vel, spin = _vec(hit, BALL_POS), _vec(hit, BALL_VEL), _vec(hit, BALL_SPIN)
+    pos, vel, spin = vec_at(hit, BALL_POS), vec_at(hit, BALL_VEL), vec_at(hit, BALL_SPIN)
     q, qd = _joints(hit, JOINT_POS), _joints(hit, JOINT_VEL)
     result = hit_result(q, qd, pos, vel, spin, condition, model)
     for joint in range(7):
@@ -376,7 +371,7 @@ def correction(
     target_x = min(max(condition[8], NEAREST), TABLE_HALF_LENGTH - EDGE)
     target_y = min(max(condition[9], EDGE - TABLE_HALF_WIDTH), TABLE_HALF_WIDTH - EDGE)
     x, y, over_net = flies_to(
-        _vec(hit, LEFT_POS), _vec(hit, LEFT_VEL), _vec(hit, LEFT_SPIN), condition, model
+        vec_at(hit, LEFT_POS), vec_at(hit, LEFT_VEL), vec_at(hit, LEFT_SPIN), condition, model
     )
     miss_x, miss_y = target_x - x, target_y - y
     miss = math.sqrt(miss_x * miss_x + miss_y * miss_y)

@@ -79,7 +79,7 @@ class Rallies(NamedTuple):
     # One array, not several: with four, every step of every rally took twice as long, camera or not
     eyes: Array
     track: Array  # (B, TRACK) what the samples tell of the flight; no rows: nobody asks
-    hit: Array  # (B, HIT) ball and joints at the last legal contact; no rows: nobody asks
+    hit: Array  # (B, HIT) the last legal contact: ball before and after, joints; no rows: nobody asks
     last_action: Array  # (B, 7)
 
 

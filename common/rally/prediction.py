@@ -28,7 +28,7 @@ from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, BALL_RADIUS
 from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_MAX, SIMPLE_LIFT_SLOPE, flight_step
 from common.physics.table_bounce import table_bounce
-from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
+from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, vec_at
 from common.rally.cholesky import factor, inverse, substitute
 
 Array = npt.NDArray[np.float64]
@@ -114,18 +114,13 @@ def _weigh_in(track: Array, row: Array, rest: float, sigma: float) -> None:
 
 
 @kernel
-def _vec(row: Array, at: int) -> Vec:
-    return (row[at], row[at + 1], row[at + 2])
-
-
-@kernel
 def _lifting(track: Array, w: Vec) -> Vec:
     """Return what of a deviation ``w`` from the nominal spin shows in the lift, as unsaturated lift would show it.
 
     Where the nominal ball's lift is saturated only the spin's direction shows, and the less the faster it spins.
     """
-    nominal = _vec(track, NOMINAL_SPIN)
-    rate, most = norm(nominal), _SATURATION * norm(_vec(track, VEL))
+    nominal = vec_at(track, NOMINAL_SPIN)
+    rate, most = norm(nominal), _SATURATION * norm(vec_at(track, VEL))
     if rate <= most:
         return w
     along = dot(nominal, w) / (rate * rate)
@@ -135,9 +130,9 @@ def _lifting(track: Array, w: Vec) -> Vec:
 @kernel
 def _advance(track: Array, h: float) -> None:
     """Fly the nominal ball ``h`` seconds on, with all that is summed along it."""
-    v = _vec(track, VEL)
+    v = vec_at(track, VEL)
     drag_factor = track[NOMINAL_DRAG]
-    q, u = flight_step(_vec(track, POS), v, _vec(track, NOMINAL_SPIN), h, drag_factor, 1.0, SIMPLE)
+    q, u = flight_step(vec_at(track, POS), v, vec_at(track, NOMINAL_SPIN), h, drag_factor, 1.0, SIMPLE)
     before, after = norm(v), norm(u)
     # Half a step of nominal motion, braked all along: what is left of it is exp(-drag |v| h)
     left = math.exp(-0.5 * h * _DRAG_FACTOR * drag_factor * (before + after))
@@ -166,13 +161,13 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
         row[:] = 0.0
         row[k], row[_DV + k] = 1.0, track[LEFT_PATH]
         # (w x X)_k = w . (X x e_k); what shows of w is a symmetric map of it
-        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(_vec(track, PATH), axis)))
+        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(vec_at(track, PATH), axis)))
         row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED_PATH + k]
         _weigh_in(track, row, seen[k] - track[POS + k], position)
         row[:] = 0.0
         row[_DV + k] = track[LEFT]
-        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(_vec(track, WAY), axis)))
+        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(vec_at(track, WAY), axis)))
         row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED + k]
         _weigh_in(track, row, seen[3 + k] - track[VEL + k], velocity)
@@ -185,14 +180,14 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
 def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
     """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
     found = track[FOUND:NORMAL]
-    dw = scale(SPIN_SIGMA, _vec(found, _SPIN))
+    dw = scale(SPIN_SIGMA, vec_at(found, _SPIN))
     lifting = scale(_LIFT, _lifting(track, dw))
     k = DRAG_SIGMA * found[_DRAG]
-    pos = add(_vec(track, POS), axpy(track[LEFT_PATH], _vec(found, _DV), _vec(found, 0)))
-    pos = axpy(k, _vec(track, SLOWED_PATH), add(pos, cross(lifting, _vec(track, PATH))))
-    vel = axpy(track[LEFT], _vec(found, _DV), _vec(track, VEL))
-    vel = axpy(k, _vec(track, SLOWED), add(vel, cross(lifting, _vec(track, WAY))))
-    spin = add(_vec(track, NOMINAL_SPIN), dw)
+    pos = add(vec_at(track, POS), axpy(track[LEFT_PATH], vec_at(found, _DV), vec_at(found, 0)))
+    pos = axpy(k, vec_at(track, SLOWED_PATH), add(pos, cross(lifting, vec_at(track, PATH))))
+    vel = axpy(track[LEFT], vec_at(found, _DV), vec_at(track, VEL))
+    vel = axpy(k, vec_at(track, SLOWED), add(vel, cross(lifting, vec_at(track, WAY))))
+    spin = add(vec_at(track, NOMINAL_SPIN), dw)
     # Bad samples must not send the prediction beyond all bounds
     spin = scale(min(1.0, MOST_SPIN / max(norm(spin), 1.0)), spin)
     return pos, vel, spin, min(max(track[NOMINAL_DRAG] + k, 1.0 - MOST_DRAG), 1.0 + MOST_DRAG)
@@ -339,7 +334,7 @@ def follow(
         covariance = np.empty((6, 6))
         vel, spin = _through_bounce(then, spin, variance, covariance)
         if surprises:  # where and how fast the ball is is what the sample says
-            at, there, vel = moment, _vec(seen, 0), _vec(seen, 3)
+            at, there, vel = moment, vec_at(seen, 0), vec_at(seen, 3)
             covariance[:3] = 0.0
             covariance[:, :3] = 0.0
             for k in range(3):

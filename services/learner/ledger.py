@@ -8,10 +8,12 @@ by a dead learner (lost: no update of this one will use it). All of that is fina
 repeated. What then remains missing is in flight, or lost once the actor is dead.
 """
 
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -86,6 +88,11 @@ class Remembered:
         return cls(values["actor"], values["incarnation"], values["published"], outcomes)
 
 
+RECENT = 1024
+"""Rollouts behind the highest whose outcomes are kept one by one; older ones fold into spans: an actor that works for
+days has millions."""
+
+
 class Account:
     """What the learner knows about one incarnation of one actor."""
 
@@ -95,7 +102,11 @@ class Account:
         self.is_alive = True  # nothing that is missing will come from the dead
         self.last_heard = 0.0  # [s] on the caller's clock
         self.credit_limit = 0
-        self._outcomes: dict[int, Outcome] = {}
+        self._outcomes: dict[int, Outcome] = {}  # from ``_folded`` on
+        self._spans: list[
+            tuple[int, int, Outcome]
+        ] = []  # half-open, of all numbers below ``_folded``, in order
+        self._folded = 0
         self._counts: Counter[Outcome] = Counter()
         self._missing: set[int] = set()  # published, and no outcome known
         self._published = 0
@@ -118,10 +129,14 @@ class Account:
 
     def outcome(self, sequence: int) -> Outcome | None:
         """Return what became of a rollout, or None."""
+        if sequence < self._folded:
+            return self._spans[bisect_right(self._spans, sequence, key=lambda span: span[0]) - 1][2]
         return self._outcomes.get(sequence)
 
     def settle(self, sequence: int, outcome: Outcome) -> None:
-        """Write down what became of a rollout."""
+        """Write down what became of a rollout; of one that is long final, no more."""
+        if sequence < self._folded:
+            return
         self._publish_up_to(sequence + 1)
         self._missing.discard(sequence)
         if (before := self._outcomes.get(sequence)) is not None:
@@ -129,6 +144,7 @@ class Account:
         self._outcomes[sequence] = outcome
         self._counts[outcome] += 1
         self._highest = max(self._highest, sequence)
+        self._fold()
 
     def hear(self, report: ActorReport, generation: int) -> None:
         """Take over what the actor knows and the learner of ``generation`` may not."""
@@ -158,11 +174,29 @@ class Account:
 
     def remember(self) -> Remembered:
         """Return what a checkpoint keeps."""
-        by_outcome: dict[str, list[int]] = {}
-        for sequence, outcome in sorted(self._outcomes.items()):
-            by_outcome.setdefault(outcome.value, []).append(sequence)
-        outcomes = tuple((name, spans(numbers)) for name, numbers in sorted(by_outcome.items()))
+        ranges: dict[str, list[Span]] = {}
+        recent = ((sequence, sequence + 1, outcome) for sequence, outcome in sorted(self._outcomes.items()))
+        for first, end, outcome in chain(self._spans, recent):
+            of_one = ranges.setdefault(outcome.value, [])
+            if of_one and of_one[-1][1] == first:
+                of_one[-1] = (of_one[-1][0], end)
+            else:
+                of_one.append((first, end))
+        outcomes = tuple((name, tuple(of_one)) for name, of_one in sorted(ranges.items()))
         return Remembered(self.actor, self.incarnation, self._published, outcomes)
+
+    def _fold(self) -> None:
+        """Fold what is final and long ago."""
+        while self._folded < self._highest - RECENT:
+            outcome = self._outcomes.get(self._folded)
+            if outcome is None or outcome is Fate.QUEUED:
+                return
+            del self._outcomes[self._folded]
+            if self._spans and self._spans[-1][2] == outcome:
+                self._spans[-1] = (self._spans[-1][0], self._folded + 1, outcome)
+            else:
+                self._spans.append((self._folded, self._folded + 1, outcome))
+            self._folded += 1
 
     def _publish_up_to(self, published: int) -> None:
         self._missing.update(range(self._published, published))
@@ -173,21 +207,10 @@ def restored(memory: Remembered) -> Account:
     """Return the account of a checkpoint; what was queued then died with that learner and is lost."""
     account = Account(memory.actor, memory.incarnation)
     account.is_alive = False  # until it is heard of
-    for name, ranges in memory.outcomes:
+    in_order = sorted((first, end, name) for name, ranges in memory.outcomes for first, end in ranges)
+    for first, end, name in in_order:
         outcome: Outcome = Fate(name) if name in FATES else VerdictKind(name)
-        for first, end in ranges:
-            for sequence in range(first, end):
-                account.settle(sequence, Fate.LOST if outcome is Fate.QUEUED else outcome)
+        for sequence in range(first, end):
+            account.settle(sequence, Fate.LOST if outcome is Fate.QUEUED else outcome)
     account._publish_up_to(memory.published)
     return account
-
-
-def spans(numbers: Iterable[int]) -> tuple[Span, ...]:
-    """Return increasing numbers as half-open ranges."""
-    ranges: list[list[int]] = []
-    for number in numbers:
-        if ranges and ranges[-1][1] == number:
-            ranges[-1][1] = number + 1
-        else:
-            ranges.append([number, number + 1])
-    return tuple((first, end) for first, end in ranges)

@@ -83,7 +83,7 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: Tensor  # (N, A) what the mean should change by; 0 where nothing is known
+    corrections: Tensor  # (N, A) what the mean should change by; rows of zeros: nothing is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,8 @@ def correction_loss(mean: Tensor, mean_prox: Tensor, corrections: Tensor) -> Ten
     Args:
         mean: (N, A).
         mean_prox: (N, A).
-        corrections: (N, A); rows of zeros say nothing.
+        corrections: (N, A); rows of zeros say nothing. A zero in any other says: as it was (of an action that was
+            clipped, of a drive at its limit).
     """
     says = (corrections != 0.0).any(-1)
     return 0.5 * ((mean - mean_prox - corrections).square().sum(-1) * says).mean()

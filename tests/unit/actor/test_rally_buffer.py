@@ -3,6 +3,7 @@ import pytest
 
 from common.comms.messages import RallyBatch
 from common.rally.launch import Purpose, draw_rallies
+from common.rally.launch_presets import PRESETS
 from services.actor.rally_buffer import RallyBuffer, launch_fault
 
 

@@ -4,9 +4,10 @@ import time
 
 import pytest
 
+from common.config import ConfigError
 from common.process import BAD_CONFIG
 from deploy.child import Assignment
-from deploy.config import DeployConfig, service_sections, shared_out
+from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out
 from deploy.local import check_ports, metrics_ports, prepare, settings, specs
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
@@ -69,11 +70,53 @@ def test_all_sections_agree_on_task_run_and_shards():
     assert sections["actor"]["shards"] == sections["generator"]["shards"] == 3
 
 
-@pytest.mark.parametrize(("actors", "envs"), [(1, 256), (2, 128), (8, 32), (100, 16)])
-def test_a_dataset_is_one_rollout_of_each_actor_and_as_large_with_any_number_of_them(actors, envs):
+@pytest.mark.parametrize(("actors", "envs"), [(1, 256), (2, 128), (8, 32), (16, 16), (100, 16), (1000, 16)])
+def test_a_dataset_is_one_rollout_of_each_actor_and_as_large_with_up_to_16_of_them(actors, envs):
     config = shared_out(DeployConfig(actors=actors))
+    intake = config.learner.intake
 
-    assert (config.actor.envs, config.learner.intake.dataset_rollouts) == (envs, actors)
+    assert (config.actor.envs, intake.dataset_rollouts) == (envs, actors)
+    assert intake.queue_rollouts >= 2 * intake.dataset_rollouts
+
+
+def test_what_a_run_hands_down_is_what_its_services_are_told():
+    """Every name in the table, and no other: set on the run, it shows in the service's section."""
+    changed = DeployConfig(
+        seed=7,
+        shards=9,
+        generators=3,
+        minutes=5,
+        frames=6,
+        launch="strong",
+        env={"noise": "hard", "flight": "full"},
+        network={"units": (8, 4)},
+    )
+    usual, other = (
+        service_sections(config, *words)
+        for config, words in ((DeployConfig(), ("r", "e", "f")), (changed, ("s", "d", "g")))
+    )
+    by_the_process = {"id", "index"}  # on its command line
+    for role, names in HANDED_DOWN.items():
+        differing = {name for name in usual[role] if usual[role][name] != other[role][name]}
+        constant = {"mode"} & set(names)
+        assert differing | constant == (set(names) - by_the_process) | {"run", "endpoint", "seed"}, role
+
+
+@pytest.mark.parametrize(
+    ("flag", "instead"),
+    [
+        ("--learner.env.noise", "give --env.noise"),
+        ("--generator.noise", "give --env.noise"),
+        ("--actor.seed", "give --seed"),
+        ("--learner.minutes", "give --minutes"),
+        ("--generator.of", "give --generators"),
+        ("--evaluator.network.units", "give --network.units"),
+        ("--actor.index", "the run sets it"),
+    ],
+)
+def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
+    with pytest.raises(ConfigError, match=f"{flag} can't be set for one service: {instead}$"):
+        settings([flag, "1"])
 
 
 @pytest.mark.parametrize(

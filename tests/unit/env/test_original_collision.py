@@ -266,28 +266,32 @@ def test_contact_parameters_are_as_documented(geom, surface):
 
 
 def test_one_long_step_where_nothing_is_within_reach_is_as_good_as_ten_short_ones(monkeypatch):
-    """The same rallies with every step fine, robots moving about.
+    """The same rallies with every step fine, robots moving about, their drives late.
 
-    Measured: 1.2 mm apart at most before the bounce; behind it 13 mm in the median, for MuJoCo's bounces hang on where
-    in a step they begin (a restitution of 0.88 to 1.2 on spinning balls).
+    Measured: balls 1.2 mm apart at most before the bounce, joints 1 mm and 7-13 mrad (medians); behind the bounce
+    13 mm (median), for MuJoCo's bounces hang on where in a step they begin (a restitution of 0.88 to 1.2 on spinning
+    balls).
     """
     block = draw_rallies(64, seed=6)
 
-    def play_all() -> tuple[np.ndarray, np.ndarray, float]:
+    def play_all() -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         env = RallyEnv(64, ORIGINAL, Deck(block))
         env.reset()
-        places, states, near = [], [], []
+        gains = np.ones((64, 3, 7))
+        env.robot.set_gains(np.arange(64), gains, np.linspace(0.0, 0.010, 64))
+        places, states, joints, near = [], [], [], []
         is_first = np.ones(64, np.bool_)
         for action in random_actions(env, 20, spread=0.1):
             is_first[env.step(action).ended] = False
             places.append(np.where(is_first[:, None], env.rallies.ball[:, :3], np.nan))
             states.append(np.where(is_first, env.rallies.state, -1))
+            joints.append(np.where(is_first[:, None], env.robot.joint_pos, np.nan))
             near.append(env.robot._is_near.mean())
-        return np.array(places), np.array(states), float(np.mean(near))
+        return np.array(places), np.array(states), np.array(joints), float(np.mean(near))
 
-    places, states, near = play_all()
+    places, states, joints, near = play_all()
     monkeypatch.setattr(original_collision, "_within_reach", lambda qpos, qvel, path, out: out.fill(True))
-    fine_places, fine_states, everything = play_all()
+    fine_places, fine_states, fine_joints, everything = play_all()
     off = np.linalg.norm(places - fine_places, axis=2)
     falls, rises = ((states == state) & (fine_states == state) for state in (State.TAU_01, State.TAU_12))
 
@@ -296,6 +300,7 @@ def test_one_long_step_where_nothing_is_within_reach_is_as_good_as_ten_short_one
     assert off[falls].max() < 0.002
     assert np.median(off[rises]) < 0.03
     assert (states != fine_states).mean() < 0.01
+    assert (np.nanmedian(np.abs(joints - fine_joints), axis=(0, 1)) < 0.02).all()
 
 
 def test_a_ball_with_an_obstacle_within_reach_is_never_missed():
@@ -304,6 +309,16 @@ def test_a_ball_with_an_obstacle_within_reach_is_never_missed():
     env = make_env(512, ORIGINAL, rallies=512)
     env.reset()
     seen = 0
+    # between upper arm and forearm, nearer to the one and flying at the other
+    bent = make_env(1, ORIGINAL)
+    bent.reset()
+    bent.robot.joint_pos[0] = (0, 0, 0, 0, np.pi / 2, 0, 0)
+    elbow_x, elbow_z = -1.45, 0.33 + 0.22
+    aside, below = 0.035 + BALL_RADIUS + 0.027, 0.030 + BALL_RADIUS + 0.029
+    bent.robot.qpos[0, 7:10] = (elbow_x + aside, 0.0, elbow_z - below)
+    bent.robot.qvel[0, 7:13] = (0.0, 0.0, 8.0, 0.0, 0.0, 0.0)
+    original_collision._within_reach(bent.robot.qpos, bent.robot.qvel, bent.robot._path, bent.robot._is_near)
+    assert bent.robot._is_near[0]
     for _ in range(6):
         env.step(env.home_action + 0.5 * rng.standard_normal((512, 7)))
         pose = np.array([racket_pose(tuple(q)).centre for q in env.robot.joint_pos])

@@ -73,6 +73,16 @@ def test_the_papers_box_is_drawn_with_spin_uniform_in_a_ball(preset, most):
     np.testing.assert_allclose(rows[:, SPIN].mean(0), 0.0, atol=3 * most * np.sqrt(0.2 / 4000))
 
 
+def test_half_of_the_mixed_balls_spin_like_papers_and_half_like_strong_ones():
+    rows = draw_rallies(4000, seed=3, preset="mixed", purpose=Purpose.FALLBACK).launches
+    spin_rate = np.linalg.norm(rows[:, SPIN], axis=1)
+
+    assert spin_rate.max() <= 300.0
+    # below 100 rad/s: half of all, and 1 / 27 of the other half; three standard errors are 0.024
+    assert np.mean(spin_rate < 100.0) == pytest.approx(0.5 + 0.5 / 27, abs=0.024)
+    assert np.mean(spin_rate < 50.0) == pytest.approx(0.5 / 8 + 0.5 / 216, abs=0.013)
+
+
 @every_preset
 def test_no_ball_is_launched_without_spin(preset):
     rows = draw_rallies(2000, seed=4, preset=preset, purpose=Purpose.FALLBACK).launches

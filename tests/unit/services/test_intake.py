@@ -8,7 +8,7 @@ from common.comms.codec import encode
 from common.comms.messages import VerdictKind
 from services.actor.outbox import Flight, Outbox, OutboxConfig, report
 from services.learner.intake import Intake, IntakeConfig
-from services.learner.ledger import Account, Fate, Remembered, restored, spans
+from services.learner.ledger import Account, Fate, Remembered, restored
 from services.learner.verdicts import RULES, open_rollout
 from tests.unit.comms.message_examples import make_rollout
 from tests.unit.comms.test_codec import sealed
@@ -211,11 +211,6 @@ def test_a_checkpoint_remembers_every_outcome_and_what_was_queued_is_lost():
     assert ledger.balance == 0
     verdict = again.arrive(make_header(0), ROLLOUT, 0.0)
     assert (verdict.kind, verdict.first) == (VerdictKind.DUPLICATE, VerdictKind.ACCEPTED)
-
-
-def test_spans_hold_numbers_as_ranges():
-    assert spans([]) == ()
-    assert spans([0, 1, 2, 5, 7, 8]) == ((0, 3), (5, 6), (7, 9))
 
 
 def test_a_restored_account_settles_nothing_twice():
