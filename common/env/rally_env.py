@@ -18,6 +18,7 @@ from common.rally import play
 from common.rally.draws import Stream, between, uniform
 from common.rally.noise import PROFILES, Condition, NoiseProfile
 from common.rally.observation import ACTION_SIZE, ObservationConfig, critic_layout, size
+from common.rally.prediction import new_tracks
 from common.rally.reward import RewardConfig, reward_table
 from common.rally.trajectory import Outcome, transition_table
 
@@ -192,11 +193,12 @@ class RallyEnv:
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
         self._review = self._make_review()
+        is_tracked = config.observation.spin == "estimated" or config.observation.prediction
         self._rallies, self._step = play.allocate(
             count,
             config.observation.history,
             full=config.perception == "full",
-            tracked=config.observation.spin == "estimated" or config.observation.prediction,
+            tracks=new_tracks(count, config.observation.spin_expected) if is_tracked else play.NO_TRACKS,
             reviewed=self._review is not None,
             path_rows=path_rows,
         )

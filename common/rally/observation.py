@@ -118,6 +118,11 @@ class ObservationConfig(BaseModel):
         description="the ball's spin as the policy is told it: not at all, as its flight tells (prediction.py), or "
         "the truth: a ceiling, nothing for a robot",
     )
+    spin_expected: Literal["mild", "strong"] = Field(
+        "mild",
+        description="how fast balls are expected to spin: to 100 or to 300 rad/s. What a flight hides, for lift "
+        "saturates, is taken from that",
+    )
     prediction: bool = Field(
         True,
         description="tell the policy where the ball is now and how it will come to be met, from all its samples "

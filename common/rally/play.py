@@ -4,7 +4,7 @@ Each ball is played by one readable function on its own row; the batch is a loop
 batch's size or order, so a batch equals its rallies played one by one, bit for bit.
 """
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at,
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit, note_leaving
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
-from common.rally.prediction import PREDICTED, PRESENT, SPIN, TRACK, begin_track, follow, predict
+from common.rally.prediction import PREDICTED, PRESENT, SPIN, begin_track, follow, new_tracks, predict
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
 Array = npt.NDArray[np.float64]
@@ -45,6 +45,7 @@ FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
 SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
 NO_SAMPLE = -1.0  # state of a sample that is none: a path ends before it
+NO_TRACKS: Final = new_tracks(0)
 FEWEST_SHOTS = 12  # of the camera, before what the estimator makes of them is followed
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
@@ -138,7 +139,7 @@ def allocate(
     count: int,
     history: int = 0,
     full: bool = False,
-    tracked: bool = False,
+    tracks: Array = NO_TRACKS,
     reviewed: bool = False,
     path_rows: int = 0,
 ) -> tuple[Rallies, Step]:
@@ -148,7 +149,7 @@ def allocate(
         count: B.
         history: How many earlier samples are remembered.
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
-        tracked: Whether the flight is followed: spin estimated, the meeting predicted.
+        tracks: ``prediction.new_tracks``, where flights are followed: spin estimated, the meeting predicted.
         reviewed: Whether contacts are kept, for ``hindsight``.
         path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """
@@ -170,7 +171,7 @@ def allocate(
         seen=np.zeros((count, SAMPLE + 1)),
         earlier=np.zeros((count, history, 6)),
         eyes=np.zeros((count if full else 0, FILM + ESTIMATE)),
-        track=np.zeros((count if tracked else 0, TRACK)),
+        track=tracks,
         hit=np.zeros((count if reviewed else 0, HIT)),
         last_action=np.zeros((count, 7)),
     )

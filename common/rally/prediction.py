@@ -20,6 +20,8 @@ The prediction is the nominal flight from there on, through an average table's b
 """
 
 import math
+from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +53,8 @@ RIGHT = NORMAL + UNKNOWNS * UNKNOWNS  # right side (10)
 PRESENT = RIGHT + UNKNOWNS  # position [m] and velocity [m/s] now (6)
 MEETING = PRESENT + 6  # in how long [s], position [m] and velocity [m/s] then (7)
 SPIN = MEETING + 7  # spin behind the bounce [rad/s] (3)
-TRACK = SPIN + 3  # numbers in a row
+FACTOR, FACTOR_SIGMA = SPIN + 3, SPIN + 4  # of ``EXPECTED``: given, and the row's for good
+TRACK = SPIN + 5  # numbers in a row
 PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and meeting
 
 MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
@@ -66,8 +69,9 @@ TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-]
 BOUNCE_PLACE_SIGMA = 0.006  # [m] a axis: where the bounce was, as foreseen
 BOUNCE_SPEED_SIGMA = 0.05  # [m/s] a axis: with what velocity
 BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
-# Where lift saturates (at 62 rad/s and 5 m/s) a ball spins faster than its flight shows: so much on average, `paper`
-SATURATED, SATURATED_SIGMA = 1.2, 0.2  # [-] of the spin that the flight shows, and how uncertain that is
+# Lift saturates (at 62 rad/s and 5 m/s): how fast a ball spins by what its flight shows, mean and sigma [-], is a
+# matter of what balls are expected. Measured at the bounce of `paper` and `strong` balls: 1.2, 3.3
+EXPECTED: Final[Mapping[str, tuple[float, float]]] = {"mild": (1.2, 0.2), "strong": (3.3, 1.0)}
 _LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
 _SATURATION = SIMPLE_LIFT_MAX / (
     SIMPLE_LIFT_SLOPE * BALL_RADIUS
@@ -76,6 +80,13 @@ _DRAG_FACTOR = AIR_FACTOR * SIMPLE_DRAG
 _STEP = 0.020  # [s] of the flight that is foretold: Runge-Kutta errs by less than 0.01 mm in it
 _LONGEST = 1.0  # [s] farther ahead nothing is foretold
 _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not foreseen
+
+
+def new_tracks(count: int, expected: str = "mild") -> Array:
+    """Return rows (count, TRACK) for balls that are expected to spin as ``EXPECTED`` says."""
+    tracks = np.zeros((count, TRACK))
+    tracks[:, [FACTOR, FACTOR_SIGMA]] = EXPECTED[expected]
+    return tracks
 
 
 @kernel
@@ -91,7 +102,7 @@ def begin_track(
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
     """
-    track[:] = 0.0
+    track[:FACTOR] = 0.0
     track[MOMENT], track[BEGUN] = moment, moment
     track[POS : POS + 6] = seen[:6]
     track[NOMINAL_DRAG], track[LEFT] = 1.0, 1.0
@@ -226,23 +237,25 @@ def _fly(pos: Vec, vel: Vec, spin: Vec, drag: float, duration: float) -> tuple[V
 
 
 @kernel
-def _through_bounce(vel: Vec, shown: Vec, variance: Array, covariance: Array) -> tuple[Vec, Vec]:
+def _through_bounce(
+    vel: Vec, shown: Vec, expected: float, sigma: float, variance: Array, covariance: Array
+) -> tuple[Vec, Vec]:
     """Return velocity and spin to be expected behind the bounce, and write their covariance (6, 6).
 
     Args:
         vel: Velocity before it [m/s].
         shown: Spin before it, as the flight shows it [rad/s].
+        expected: By how much faster it is expected to spin [-].
+        sigma: Of that [-].
         variance: Of the fit's unknowns (10, 10).
         covariance: Written.
     """
-    spin = scale(SATURATED, shown)
+    spin = scale(expected, shown)
     square, spread = np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             fit = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN + i, _SPIN + j]
-            square[i, j] = SATURATED * SATURATED * fit + SATURATED_SIGMA * SATURATED_SIGMA * (
-                fit + shown[i] * shown[j]
-            )
+            square[i, j] = expected * expected * fit + sigma * sigma * (fit + shown[i] * shown[j])
     factor(square, spread)
     points = np.empty((10, 6))
     reach = math.sqrt(5.0)
@@ -332,7 +345,7 @@ def follow(
         if surprises:
             then = (seen[3], seen[4], -abs(seen[5]))
         covariance = np.empty((6, 6))
-        vel, spin = _through_bounce(then, spin, variance, covariance)
+        vel, spin = _through_bounce(then, spin, track[FACTOR], track[FACTOR_SIGMA], variance, covariance)
         if surprises:  # where and how fast the ball is is what the sample says
             at, there, vel = moment, vec_at(seen, 0), vec_at(seen, 3)
             covariance[:3] = 0.0
@@ -360,7 +373,11 @@ def predict(track: Array, now: float) -> None:
             flat = (then[0], then[1], min(then[2], -0.1))
             pos = there
             vel, spin = table_bounce(
-                flat, scale(SATURATED, spin), (0.0, 0.0, 1.0), TABLE_RESTITUTION0_MEAN, TABLE_FRICTION_MEAN
+                flat,
+                scale(track[FACTOR], spin),
+                (0.0, 0.0, 1.0),
+                TABLE_RESTITUTION0_MEAN,
+                TABLE_FRICTION_MEAN,
             )
             if ahead >= wait:
                 here, speed = _fly(pos, vel, spin, drag, ahead - wait)
