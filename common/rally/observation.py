@@ -4,7 +4,7 @@
 """
 
 import sys
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -91,6 +91,19 @@ ACTION: tuple[Part, ...] = (
 )
 
 
+JOINT_RANGES: Final = (
+    # name, unit, half-range: targets reach from -half-range to half-range; home
+    ("rail_x", "m", 0.75, 0.0),
+    ("rail_y", "m", 0.90, 0.0),
+    ("yaw", "rad", 2.9, 0.0),
+    ("pitch", "rad", 1.75, 1.0),
+    ("elbow", "rad", 2.4, 1.0),
+    ("wrist", "rad", 2.1, 1.1),
+    ("roll", "rad", 2.9, 0.0),
+)
+"""The robot's joints in the order of observation and action, as ``common/env/robot.xml`` has them."""
+
+
 def size(layout: tuple[Part, ...]) -> int:
     """Return how many numbers a layout holds."""
     return sum(part.size for part in layout)
@@ -160,17 +173,34 @@ def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
 ACTION_SIZE = size(ACTION)
 
 
+def _index(where: slice) -> str:
+    return f"{where.start}-{where.stop - 1}" if where.stop - where.start > 1 else str(where.start)
+
+
 def markdown() -> str:
     """Return both layouts as the text of docs/observation.md."""
     lines = [
         "# Observation and action",
         "",
         "World frame: origin at the centre of the table top, x from the robot to the opponent, y to the robot's left,",
-        "z up.",
+        "z up. Racket frame: x the face's normal, towards the opponent at home; z towards the handle.",
+        "tau_01 coming, tau_12 bounced on the robot's court, tau_23 hit, tau_30 landed.",
         "Generated: `python -m common.rally.observation > docs/observation.md`.",
+        "",
+        f"## What policies see by default: {size(policy_layout(ObservationConfig()))} numbers",
+        "",
+        "| index | name |",
+        "|---|---|",
+    ]
+    for name, where in offsets(policy_layout(ObservationConfig())).items():
+        lines.append(f"| {_index(where)} | {name} |")
+    lines += [
+        "",
+        "The first 37 are the paper's; the others are options, each explained below. A policy's contract.json names",
+        "its own. All are raw numbers: the normaliser comes with the policy.",
     ]
     tables = (
-        ("Observation", OBSERVATION),
+        ("The paper's", OBSERVATION),
         ("Option spin estimated, after it", SPIN_ESTIMATE),
         ("Option spin true, in its place", SPIN),
         ("Option prediction, after that", PREDICTION),
@@ -189,10 +219,18 @@ def markdown() -> str:
         ]
         for name, where in offsets(layout).items():
             part = next(part for part in layout if part.name == name)
-            index = f"{where.start}-{where.stop - 1}" if part.size > 1 else str(where.start)
-            lines.append(
-                f"| {index} | {name} | {part.unit} | {part.low:g} to {part.high:g} | {part.meaning} |"
-            )
+            numbers = f"{part.low:g} to {part.high:g}"
+            lines.append(f"| {_index(where)} | {name} | {part.unit} | {numbers} | {part.meaning} |")
+    lines += [
+        "",
+        "Targets beyond -1 to 1 are clipped. Gains and force limits stand in `common/env/robot.xml`.",
+        "",
+        "| joint | half-range | home |",
+        "|---|---|---|",
+    ]
+    lines += [
+        f"| {name} | {half_range:g} {unit} | {home:g} |" for name, unit, half_range, home in JOINT_RANGES
+    ]
     return "\n".join(lines) + "\n"
 
 

@@ -239,6 +239,38 @@ def _estimate(rallies: Rallies, b: int, noise: NoiseProfile) -> None:
 
 
 @kernel
+def follow_flight(
+    track: Array,
+    seen: Array,
+    moment: float,
+    now: float,
+    is_first: bool,
+    position_noise: float,
+    velocity_noise: float,
+) -> None:
+    """Let a track (``prediction.TRACK``,) follow the sample that the robot goes by ``now``.
+
+    Args:
+        track: Written.
+        seen: Position [m], velocity [m/s], trajectory state 0..3.
+        moment: When it was taken [s].
+        now: [s].
+        is_first: Whether the flight begins with it.
+        position_noise: Its sigma a axis [m].
+        velocity_noise: [m/s].
+    """
+    if is_first:
+        begin_track(track, seen, moment, position_noise, velocity_noise)
+        predict(track, now)
+    elif seen[6] <= 1.0:
+        follow(track, seen, moment, seen[6] == 1.0, position_noise, velocity_noise)
+        predict(track, now)
+    else:  # it was hit: what was followed is over
+        for k in range(6):
+            track[PRESENT + k] = seen[k]
+
+
+@kernel
 def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     """Update what the robot sees of ball b, and what it remembers."""
     earlier = rallies.earlier[b]
@@ -251,19 +283,13 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     else:
         _sample(rallies, b, step, noise)
     if rallies.track.shape[0] > 0:
-        track, now = rallies.track[b], rallies.clock[b] * GRID_STEP
         # An estimator's first estimates are its guess at what balls do: they tell of nothing yet
         guesses = rallies.eyes.shape[0] > 0 and rallies.eyes[b, FILM + COUNT] < FEWEST_SHOTS
-        if step == 0 or (seen[6] == 0.0 and guesses):
-            begin_track(track, seen, seen[_TAKEN], noise.position_noise, noise.velocity_noise)
-            predict(track, now)
-        elif seen[6] <= 1.0:
-            bounced = seen[6] == 1.0
-            follow(track, seen, seen[_TAKEN], bounced, noise.position_noise, noise.velocity_noise)
-            predict(track, now)
-        else:  # it was hit: what was followed is over
-            for k in range(6):
-                track[PRESENT + k] = seen[k]
+        is_first = step == 0 or (seen[6] == 0.0 and guesses)
+        now = rallies.clock[b] * GRID_STEP
+        follow_flight(
+            rallies.track[b], seen, seen[_TAKEN], now, is_first, noise.position_noise, noise.velocity_noise
+        )
 
 
 @kernel

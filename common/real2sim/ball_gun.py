@@ -35,7 +35,7 @@ def read_hdf5(path: Path) -> Recordings:
     try:
         import h5py  # noqa: PLC0415 - an extra: other formats go without
     except ImportError:
-        raise RecordingError(f"{path}: HDF5 needs h5py: pip install 'topspin[real2sim]'") from None
+        raise RecordingError(f"{path}: HDF5 needs h5py: pip install -e '.[real2sim]'") from None
     label = next((known for known in LABELS if known in path.stem), "")
     dropped: Counter[str] = Counter()
     tracks: list[Track] = []

@@ -33,7 +33,7 @@ def wanted(module: str) -> Any:
     except ImportError as error:
         raise RenderError(
             f"pictures need {module.partition('.')[0]}, which can't be imported ({error}); "
-            "pip install 'topspin[report]'"
+            "pip install -e '.[report]'"
         ) from None
 
 

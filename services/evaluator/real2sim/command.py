@@ -127,5 +127,5 @@ def _page() -> ModuleType:
     try:
         from services.evaluator.real2sim import page  # noqa: PLC0415 - an extra: measuring goes without
     except ModuleNotFoundError as error:
-        raise ReportedError(f"a report needs {error.name}: pip install 'topspin[report]'") from None
+        raise ReportedError(f"a report needs {error.name}: pip install -e '.[report]'") from None
     return page

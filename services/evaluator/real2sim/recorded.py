@@ -203,7 +203,7 @@ def _fitted(
         from common.real2sim.fit_problem import FitOptions  # noqa: PLC0415 - scipy, an extra: states go without
         from common.real2sim.identify import fit  # noqa: PLC0415 - the same
     except ImportError:
-        raise RecordingError("fitting tracks needs scipy: pip install 'topspin[real2sim]'") from None
+        raise RecordingError("fitting tracks needs scipy: pip install -e '.[real2sim]'") from None
     options = FitOptions(flight=model)
     kept, fits = list[Track](), list["Fit"]()
     said = started = time.monotonic()

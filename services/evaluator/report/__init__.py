@@ -15,5 +15,5 @@ differ in nothing but their seed together, and writes report.md, report.html, re
 ``command``     the command line
 ==============  ==============================================================================
 
-matplotlib and jinja2 come with ``pip install 'topspin[report]'``; nothing outside of this package imports them.
+matplotlib and jinja2 come with ``pip install -e '.[report]'``; nothing outside of this package imports them.
 """

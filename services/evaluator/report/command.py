@@ -71,5 +71,5 @@ def _drawing() -> tuple[ModuleType, ModuleType]:
     try:
         from services.evaluator.report import figures, page  # noqa: PLC0415 - an extra: the service goes without
     except ModuleNotFoundError as error:
-        raise ReportedError(f"a report needs {error.name}: pip install 'topspin[report]'") from None
+        raise ReportedError(f"a report needs {error.name}: pip install -e '.[report]'") from None
     return figures, page

@@ -44,7 +44,7 @@ def test_play_films_the_first_rallies(folder, tmp_path, capsys):
         Painter(64, 64).close()
     except RenderError as error:
         pytest.skip(f"no OpenGL here: {error}")
-    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing: pip install 'topspin[report]'")
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing: pip install -e '.[report]'")
     video = tmp_path / "play.mp4"
     arguments = (
         f"--policy {folder} --rallies 3 --film-rallies 1 --video {video} --width 320 --height 180 "

@@ -61,7 +61,7 @@ def write_csv(path, *tracks):
 
 
 def write_hdf5(path, track):
-    h5py = pytest.importorskip("h5py", reason="h5py is missing: pip install 'topspin[real2sim]'")
+    h5py = pytest.importorskip("h5py", reason="h5py is missing: pip install -e '.[real2sim]'")
     with h5py.File(path, "w") as file:
         group = file.create_group("originals/0")
         group["time_stamps"] = track.times
@@ -272,8 +272,8 @@ def test_it_stops_when_it_is_asked_to(policy, tmp_path):
 
 
 def test_the_report_holds_tables_and_plots(policy, tmp_path, capsys):
-    pytest.importorskip("matplotlib", reason="matplotlib is missing: pip install 'topspin[report]'")
-    pytest.importorskip("jinja2", reason="jinja2 is missing: pip install 'topspin[report]'")
+    pytest.importorskip("matplotlib", reason="matplotlib is missing: pip install -e '.[report]'")
+    pytest.importorskip("jinja2", reason="jinja2 is missing: pip install -e '.[report]'")
     write_states(tmp_path / "s.json", draw_rallies(3, seed=2, noise="off").launches)
     write_csv(tmp_path / "t.csv", seen(COMING, noise=1e-3))
     out = tmp_path / "report"

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def gun_tracks():
-    pytest.importorskip("h5py", reason="h5py is missing: pip install 'topspin[real2sim]'")
+    pytest.importorskip("h5py", reason="h5py is missing: pip install -e '.[real2sim]'")
     return [track for found in load_folder(DATA / "mpi_ball_gun", "*.hdf5") for track in found.tracks]
 
 

@@ -12,7 +12,7 @@ from common.real2sim.recordings import load, load_folder
 from common.real2sim.tracks import RecordingError
 from tests.unit.real2sim.flights import launch_of, seen
 
-h5py = pytest.importorskip("h5py", reason="h5py is missing: pip install 'topspin[real2sim]'")
+h5py = pytest.importorskip("h5py", reason="h5py is missing: pip install -e '.[real2sim]'")
 
 TRACK = seen(launch_of())
 STATE = dict(zip(COLUMNS, (0.1, 1.2, 0.4, 0.5, -5.0, 1.5, 30.0, -4.0, 7.0), strict=True))

@@ -23,7 +23,7 @@ SIZE = (320, 180)
 @pytest.fixture(scope="module", autouse=True)
 def _libraries():
     for module in ("PIL", "imageio_ffmpeg"):
-        pytest.importorskip(module, reason=f"{module} is missing: pip install 'topspin[report]'")
+        pytest.importorskip(module, reason=f"{module} is missing: pip install -e '.[report]'")
 
 
 @pytest.fixture(scope="module")
