@@ -48,10 +48,11 @@ fix: $(STAMP)             ## format, and mend what ruff can
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(STAMP)           ## all benchmarks
+bench: $(STAMP)           ## the quick benchmarks
 	$(BIN)/python -m benchmarks.generator --json
 	$(BIN)/python -m benchmarks.env --json
 	$(BIN)/python -m benchmarks.estimator --json
+	$(BIN)/python -m benchmarks.prediction --json
 	$(BIN)/python -m benchmarks.system --json
 
 clean:                    ## remove the environment and caches, not the runs
