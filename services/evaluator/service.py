@@ -64,6 +64,12 @@ def score(stage: int, found: dict[str, Any]) -> tuple[int, float]:
     return stage, (found["return_rate"] or 0.0) - (error if error is not None else 1.0)
 
 
+def measured_alike(contract: Contract, config: EvaluatorConfig) -> bool:
+    """Return whether a policy's measures are of as many balls of the same kind, seen alike, as ``config`` asks for."""
+    theirs = (contract.measures.get("rallies"), contract.launch, contract.noise, contract.observation_options)
+    return theirs == (config.rallies, config.launch, config.env.noise, config.env.observation)
+
+
 class EvaluatorService:
     """Follows one run.
 
@@ -154,7 +160,7 @@ class EvaluatorService:
         """Return the score of the best policy that an earlier life kept, if it was measured as we measure."""
         try:
             contract = load_policy(self._folder.best_policy).contract
-            if contract.measures["rallies"] != self._config.rallies:
+            if not measured_alike(contract, self._config):
                 return None
             return score(contract.stage, dict(contract.measures))
         except (PolicyError, KeyError):

@@ -3,9 +3,11 @@ import json
 import numpy as np
 import pytest
 
+from common.policy.weights import contract_of
 from common.rally.trajectory import Outcome
+from services.evaluator.config import EvaluatorConfig
 from services.evaluator.measures import measures, wilson
-from services.evaluator.service import score
+from services.evaluator.service import measured_alike, score
 from tests.unit.evaluator.played import make_played
 
 
@@ -75,3 +77,24 @@ def test_best_is_a_later_stage_then_a_percent_of_balls_against_a_centimetre():
     ]
 
     assert ranking == sorted(ranking)
+
+
+@pytest.mark.parametrize(
+    ("now", "alike"),
+    [
+        ({}, True),
+        ({"rallies": 500}, False),
+        ({"launch": "strong"}, False),
+        ({"env": {"noise": "hard"}}, False),
+        ({"env": {"observation": {"spin_expected": "strong"}}}, False),
+        ({"seed": 4, "interval_s": 5.0}, True),
+    ],
+)
+def test_a_best_that_was_measured_on_other_balls_is_no_best(now, alike):
+    """A run that is resumed with another launch preset would keep the policy of the easier balls for good."""
+    kept = EvaluatorConfig()
+    contract = contract_of(
+        kept.env, kept.network, kept.launch, run="r", generation=1, version=1, stage=3, frames=1
+    ).model_copy(update={"measures": {"rallies": kept.rallies}})
+
+    assert measured_alike(contract, EvaluatorConfig(**now)) == alike
