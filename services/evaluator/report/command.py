@@ -50,6 +50,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     config = settings(argv)
     set_up_logging("info", "report")
     figures, page = _drawing()  # before hours of play, not after
+    page.note(config.note)
     folders = list(dict.fromkeys(find(run).root for run in config.runs))  # each once, whatever it was called
     runs = [read(str(folder), config.policy) for folder in folders]
 

@@ -16,6 +16,9 @@ class ReportConfig(BaseModel):
         (), description="runs, by name under runs/ or by folder; RUN... is short for it"
     )
     out: str = Field("runs/report", min_length=1, description="folder of the report; made if it isn't there")
+    note: str = Field(
+        "", description="text file whose paragraphs stand at the top: what it comes to, in words"
+    )
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies that each policy plays")
     seed: int = Field(20260, ge=0, lt=2**63, description="of these rallies")
     launch: PresetName = Field("paper", description="launch preset")

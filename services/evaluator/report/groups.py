@@ -8,7 +8,7 @@ from services.evaluator.report.collect import Run
 
 BOOKKEEPING: Final = frozenset(
     {
-        "run", "seed", "id", "index", "folder", "resume", "minutes", "panel", "evaluate", "final_rallies",
+        "run", "seed", "id", "index", "folder", "resume", "minutes", "frames", "panel", "evaluate", "final_rallies",
         "endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib", "mode",
         "tls_ca", "tls_certificate", "tls_key", "metrics_port", "metrics_host",
         "log_level", "status_interval_s", "silence_warning_s", "checkpoint_interval_s", "niceness",

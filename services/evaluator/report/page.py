@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jinja2
 
+from common.errors import ReportedError
 from services.evaluator.report import tables
 from services.evaluator.report.figures import Drawing
 from services.evaluator.report.results import NOISE, Results, as_json
@@ -45,6 +46,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
                 "to their end. Runs that differ in nothing but their seed are taken together.",
             ),
         ),
+        Section("In words", note(config.note)),
         Section("Missing", missing=found.missing),
         Section("Beside the paper", tables=(tables.headline(found),)),
         Section("Training", drawings=named("curves")),
@@ -61,6 +63,18 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
         ]
     parts.append(Section("How it was made", (_machine(found),), code=_commands(found)))
     return [part for part in parts if part.text or part.missing or part.tables or part.drawings]
+
+
+def note(path: str) -> tuple[str, ...]:
+    """Return the paragraphs of a text file; none without a path. Raises ReportedError where it can't be read."""
+    if not path:
+        return ()
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it isn't UTF-8 text"
+        raise ReportedError(f"can't read the note {path}: {reason}") from None
+    return tuple(" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip())
 
 
 def _machine(found: Results) -> str:
@@ -83,10 +97,11 @@ def _commands(found: Results) -> str:
     config = found.settings
     runs = " ".join(result.run.name for one in found.groups for result in one.runs)
     rounds = " --rounds-too" if config.rounds_too else ""
+    noted = f" --note {config.note}" if config.note else ""
     lines += [
         "# this report",
         f"python -m services.evaluator report {runs} --rallies {config.rallies} --seed {config.seed} "
-        f"--launch {config.launch} --policy {config.policy}{rounds}",
+        f"--launch {config.launch} --policy {config.policy}{rounds}{noted}",
     ]
     return "\n".join(lines)
 

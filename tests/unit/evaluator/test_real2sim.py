@@ -258,7 +258,7 @@ def test_without_its_libraries_a_report_names_the_extra(policy, tmp_path, monkey
     monkeypatch.delattr(real2sim, "page", raising=False)
     flags = ["--data", str(tmp_path / "gone.json"), "--policy", policy, "--out", str(tmp_path / "o")]
 
-    with pytest.raises(ReportedError, match=r"pip install 'topspin\[report\]'"):
+    with pytest.raises(ReportedError, match=r"pip install -e '\.\[report\]'"):
         command.main(flags, Event())  # said before the recordings are looked at
 
 

@@ -123,7 +123,16 @@ def test_runs_that_differ_only_in_seed_name_and_reach_are_one_experiment():
     runs = [
         make_run("a", ppo={"clip": 0.2}, run="a", endpoint="tcp/1", minutes=1.0),
         make_run("b", ppo={"clip": 0.1}),
-        make_run("c", ppo={"clip": 0.2}, run="c", endpoint="tcp/2", metrics_port=9, minutes=2.0, folder="x"),
+        make_run(
+            "c",
+            ppo={"clip": 0.2},
+            run="c",
+            endpoint="tcp/2",
+            metrics_port=9,
+            minutes=2.0,
+            frames=7,
+            folder="x",
+        ),
     ]
     runs[2].settings["learner"]["seed"] = 5
 
@@ -278,7 +287,7 @@ def test_without_its_libraries_a_report_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "services.evaluator.report.figures", None)
     monkeypatch.delattr(report, "figures", raising=False)  # where an earlier test has imported it
 
-    with pytest.raises(ReportedError, match=r"pip install 'topspin\[report\]'"):
+    with pytest.raises(ReportedError, match=r"pip install -e '\.\[report\]'"):
         command.main([str(write_run(tmp_path, "a"))], Event())
 
 
@@ -295,7 +304,10 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     write_run(tmp_path, "a", seed=0)
     (write_run(tmp_path, "b", seed=1) / "metrics.csv").unlink()
 
-    command.main(["a", "b", "a", "--rallies", "24", "--envs", "24", "--rounds-too", "--out", "o"], Event())
+    (tmp_path / "note.txt").write_text("It plays\nwell | mostly.\n\n\nSecond <thing>.\n")
+
+    words = ["a", "b", "a", "--rallies", "24", "--envs", "24", "--rounds-too", "--out", "o"]
+    command.main([*words, "--note", "note.txt"], Event())
 
     assert capsys.readouterr().out.split() == ["o/report.md", "o/report.html", "o/results.json"]
     found = json.loads((tmp_path / "o" / "results.json").read_text())
@@ -309,11 +321,23 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     page = (tmp_path / "o" / "report.md").read_text()
     assert "| **Topspin, stages 1+2+3 (2 seeds)** | yes |" in page
     assert "- b: no epochs in metrics.csv" in page
+    assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
+    assert "--rounds-too --note note.txt" in page
     assert "python -m deploy.local --run b --seed 1" in page
     drawn = re.findall(r"!\[.*?\]\((.*?)\)", page)
     assert {"curves_frames.png", "landings.png", "courts.png", "rates.png", "rounds.png"} <= set(drawn)
     assert all((tmp_path / "o" / name).stat().st_size > 5000 for name in drawn)
     html = (tmp_path / "o" / "report.html").read_text()
     assert html.count("<img ") == len(drawn)
+    assert "<p>Second &lt;thing&gt;.</p>" in html
     assert set(re.findall(r'(?:src|href)="(.{22})', html)) == {"data:image/png;base64,"}
     assert str(tmp_path) not in page + html + json.dumps(found)
+
+
+def test_a_note_that_cant_be_read_is_said_before_anything_is_played(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path, "a")
+
+    with pytest.raises(ReportedError, match=r"can't read the note no\.txt: No such file"):
+        command.main(["a", "--note", "no.txt"], Event())
+    assert not (tmp_path / "runs" / "report").exists()

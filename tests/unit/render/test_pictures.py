@@ -189,7 +189,7 @@ def test_the_showpiece_is_the_return_that_lands_nearest():
 
 
 def test_what_is_missing_is_named_with_what_to_do(monkeypatch):
-    with pytest.raises(RenderError, match=r"pictures need no_such_library.*pip install 'topspin\[report\]'"):
+    with pytest.raises(RenderError, match=r"pictures need no_such_library.*pip install -e '\.\[report\]'"):
         wanted("no_such_library")
 
     monkeypatch.delenv("MUJOCO_GL", raising=False)
