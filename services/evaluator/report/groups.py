@@ -38,6 +38,7 @@ def leaves(settings: Mapping[str, Any], parent: str = "") -> Iterator[tuple[str,
             yield f"{parent}{name}", value
 
 
+USUAL: Final = ["estimated spin", "prediction", "sample age"]
 SPINS: Final[Mapping[str, list[str]]] = {"hidden": [], "estimated": ["estimated spin"], "true": ["true spin"]}
 
 
@@ -65,11 +66,12 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     more += SPINS[seen.get("spin", "hidden")]
     more += ["prediction"] if seen.get("prediction", False) else []
     more += ["sample age"] if seen.get("age", False) else []
+    told = "" if more == USUAL else " + ".join(more) or "37 numbers"
     critic = seen.get("critic", "policy")
     return (
         (stages, stages),
         (collision, "" if collision == "tailored collisions" else collision),
-        (" + ".join(["sees 37 numbers", *more]), " + ".join(more)),
+        (" + ".join(["sees 37 numbers", *more]), told),
         ("critic sees the truth", "")
         if critic == "privileged"
         else ("critic sees what the policy does", "critic sees no more"),

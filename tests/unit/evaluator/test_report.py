@@ -147,6 +147,7 @@ def test_how_a_run_is_evaluated_makes_no_experiment():
 
 def test_groups_are_called_by_what_tells_them_apart():
     privileged = {"observation": {"critic": "privileged"}}
+    usual = {"spin": "estimated", "prediction": True, "age": True}
     groups = group(
         [
             make_run("a", env=privileged),
@@ -155,16 +156,18 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("d", env={"observation": {"critic": "policy", "history": 8, "spin": "true"}}),
             make_run("e", env={"observation": {"critic": "policy", "spin": "estimated", "age": True}}),
             make_run("f", env={"observation": {"critic": "privileged", "prediction": True}}),
+            make_run("g", env={"observation": {"critic": "privileged"} | usual}),
         ]
     )
 
     assert [one.label for one in groups] == [
-        "stages 1+2+3",
-        "stage 3 only",
-        "stages 1+2+3, original collisions",
+        "stages 1+2+3, 37 numbers",
+        "stage 3 only, 37 numbers",
+        "stages 1+2+3, original collisions, 37 numbers",
         "stages 1+2+3, history 8 + true spin, critic sees no more",
         "stages 1+2+3, estimated spin + sample age, critic sees no more",
         "stages 1+2+3, prediction",
+        "stages 1+2+3",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"
