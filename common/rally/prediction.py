@@ -125,17 +125,22 @@ def _weigh_in(track: Array, row: Array, rest: float, sigma: float) -> None:
 
 
 @kernel
-def _lifting(track: Array, w: Vec) -> Vec:
-    """Return what of a deviation ``w`` from the nominal spin shows in the lift, as unsaturated lift would show it.
+def _saturation(track: Array) -> tuple[float, Vec]:
+    """Return which share of more spin shows in the nominal ball's lift, and the axis along which none does.
 
-    Where the nominal ball's lift is saturated only the spin's direction shows, and the less the faster it spins.
+    Where its lift is saturated only the spin's direction shows, and the less the faster it spins.
     """
     nominal = vec_at(track, NOMINAL_SPIN)
     rate, most = norm(nominal), _SATURATION * norm(vec_at(track, VEL))
     if rate <= most:
-        return w
-    along = dot(nominal, w) / (rate * rate)
-    return scale(most / rate, axpy(-along, nominal, w))
+        return 1.0, (0.0, 0.0, 0.0)
+    return most / rate, scale(1.0 / rate, nominal)
+
+
+@kernel
+def _shown(share: float, axis: Vec, w: Vec) -> Vec:
+    """Return what of ``w`` shows, as unsaturated lift would show it; a symmetric map."""
+    return scale(share, axpy(-dot(axis, w), axis, w))
 
 
 @kernel
@@ -166,19 +171,21 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
     """Add a sample to the fit, and solve it."""
     _advance(track, moment - track[MOMENT])
     position, velocity = max(position_noise, LEAST_POSITION_NOISE), max(velocity_noise, LEAST_VELOCITY_NOISE)
+    share, hidden = _saturation(track)
+    unit = share * _LIFT * SPIN_SIGMA
     row = np.empty(UNKNOWNS)
     for k in range(3):
         axis = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
         row[:] = 0.0
         row[k], row[_DV + k] = 1.0, track[LEFT_PATH]
-        # (w x X)_k = w . (X x e_k); what shows of w is a symmetric map of it
-        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(vec_at(track, PATH), axis)))
+        # (w x X)_k = w . (X x e_k), and what shows of w is a symmetric map
+        lift = _shown(unit, hidden, cross(vec_at(track, PATH), axis))
         row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED_PATH + k]
         _weigh_in(track, row, seen[k] - track[POS + k], position)
         row[:] = 0.0
         row[_DV + k] = track[LEFT]
-        lift = scale(_LIFT * SPIN_SIGMA, _lifting(track, cross(vec_at(track, WAY), axis)))
+        lift = _shown(unit, hidden, cross(vec_at(track, WAY), axis))
         row[_SPIN], row[_SPIN + 1], row[_SPIN + 2] = lift[0], lift[1], lift[2]
         row[_DRAG] = DRAG_SIGMA * track[SLOWED + k]
         _weigh_in(track, row, seen[3 + k] - track[VEL + k], velocity)
@@ -192,7 +199,8 @@ def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
     """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
     found = track[FOUND:NORMAL]
     dw = scale(SPIN_SIGMA, vec_at(found, _SPIN))
-    lifting = scale(_LIFT, _lifting(track, dw))
+    share, hidden = _saturation(track)
+    lifting = _shown(share * _LIFT, hidden, dw)
     k = DRAG_SIGMA * found[_DRAG]
     pos = add(vec_at(track, POS), axpy(track[LEFT_PATH], vec_at(found, _DV), vec_at(found, 0)))
     pos = axpy(k, vec_at(track, SLOWED_PATH), add(pos, cross(lifting, vec_at(track, PATH))))
