@@ -86,7 +86,8 @@ HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "evaluator": {"launch": "launch", "env": "env", "network": "network", "noise": "env.noise", "folder": "folder"},
 }  # fmt: skip
-"""What a service is told by the run, and which of the run's settings says it; some, only the run knows."""
+"""What a service is told by the run, and which of the run's settings says it; some, only the run knows. Id and index
+are on its command line."""
 _TO_ALL: Final = ("run", "endpoint", "seed")
 
 
@@ -105,35 +106,27 @@ def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
 
 def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str) -> dict[str, dict[str, Any]]:
     """Return what each role's section of the run's config.toml says: shared settings are written into each."""
-    shared = {"run": run, "endpoint": endpoint, "seed": config.seed}
-    env, network = config.env.model_dump(mode="json"), config.network.model_dump(mode="json")
-    shards = config.shards or config.actors
-    own: dict[str, dict[str, Any]] = {
-        "learner": {
-            "env": env,
-            "network": network,
-            "launch": config.launch,
-            "folder": folder,
-            "minutes": config.minutes,
-            "frames": config.frames,
-            "mode": "hub",
-        },
-        "actor": {"env": env, "network": network, "launch": config.launch, "shards": shards},
-        "generator": {
-            "launch": config.launch,
-            "noise": config.env.noise,
-            "flight": config.env.flight,
-            "shards": shards,
-            "of": config.generators,
-        },
-        "evaluator": {
-            "env": env,
-            "network": network,
-            "launch": config.launch,
-            "noise": config.env.noise,
-            "folder": folder,
-        },
+    told = {
+        "run": run,
+        "endpoint": endpoint,
+        "folder": folder,
+        "mode": "hub",
+        "seed": config.seed,
+        "launch": config.launch,
+        "minutes": config.minutes,
+        "frames": config.frames,
+        "generators": config.generators,
+        "shards": config.shards or config.actors,
+        "env": config.env.model_dump(mode="json"),
+        "env.noise": config.env.noise,
+        "env.flight": config.env.flight,
+        "network": config.network.model_dump(mode="json"),
     }
+    own = {
+        role: {name: told[source] for name, source in sources.items() if source in told}
+        for role, sources in HANDED_DOWN.items()
+    }
+    shared = {name: told[name] for name in _TO_ALL}
     return {
         role: getattr(config, role).model_dump(mode="json", by_alias=True) | shared | values
         for role, values in own.items()

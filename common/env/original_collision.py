@@ -30,7 +30,7 @@ from common.physics.arm import (
 )
 from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS, GRAVITY, GRID_STEP, TABLE_FRICTION
 from common.physics.flight import acceleration
-from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale
+from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, vec_at
 from common.rally import play
 from common.rally.hindsight import BOUNCE, FRESH, note_hit, note_leaving
 from common.rally.noise import NoiseProfile
@@ -150,9 +150,8 @@ def _turned(turn: Array, a: Vec) -> Vec:
 def _blow(qpos: Array, qvel: Array, condition: Array, rows: Rows, model: int, force: Array) -> None:
     """Write the air's force [N] on the balls of ``rows`` into theirs of (B, 6)."""
     for b in rows:
-        v, w = qvel[b, _BALL_VEL:], qvel[b, _BALL_SPIN:]
-        spin = _turned(qpos[b, _BALL_TURN:], (w[0], w[1], w[2]))
-        a = acceleration((v[0], v[1], v[2]), spin, condition[b, 0], condition[b, 1], model)
+        spin = _turned(qpos[b, _BALL_TURN:], vec_at(qvel[b], _BALL_SPIN))
+        a = acceleration(vec_at(qvel[b], _BALL_VEL), spin, condition[b, 0], condition[b, 1], model)
         force[b, 0], force[b, 1] = BALL_MASS * a[0], BALL_MASS * a[1]
         force[b, 2] = BALL_MASS * (a[2] + GRAVITY)  # gravity is MuJoCo's
 
@@ -179,8 +178,7 @@ def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
     """
     no_normal = (0.0, 0.0, 0.0)
     for b in range(qpos.shape[0]):
-        p, v = qpos[b, _BALL_POS:], qvel[b, _BALL_VEL:]
-        pos, vel = (p[0], p[1], p[2]), (v[0], v[1], v[2])
+        pos, vel = vec_at(qpos[b], _BALL_POS), vec_at(qvel[b], _BALL_VEL)
         table, on_table = touch.table_gap(pos)
         net, on_net = touch.net_gap(pos)
         floor, on_floor = touch.floor_gap(pos)
@@ -189,12 +187,14 @@ def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
             or _closes(net, on_net, vel, 0.0)
             or _closes(floor, on_floor, vel, 0.0)
         )
+        if out[b]:
+            continue
         for j in range(7):
             path[0, j], path[1, j] = qpos[b, j], qpos[b, j] + GRID_STEP * qvel[b, j]
         speed = speed_bound(path, GRID_STEP)
         q = joints_at(path, 0.0, GRID_STEP)
         anywhere = norm(vel) + speed  # no slope to go by: the arm isn't convex
-        if out[b] or not _closes(touch.robot_gap_bound(pos, q), no_normal, vel, anywhere):
+        if not _closes(touch.robot_gap_bound(pos, q), no_normal, vel, anywhere):
             continue
         racket, on_racket = touch.racket_gap(pos, racket_pose(q))
         body = touch.body_gap(pos, q)[0]
