@@ -27,7 +27,6 @@ Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
-_TOLD = {"hidden": play.SPIN_HIDDEN, "estimated": play.SPIN_ESTIMATED, "true": play.SPIN_TRUE}
 _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
 
 
@@ -193,12 +192,14 @@ class RallyEnv:
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
         self._review = self._make_review()
-        is_tracked = config.observation.spin == "estimated" or config.observation.prediction
+        self._told = play.told(config.observation)
         self._rallies, self._step = play.allocate(
             count,
             config.observation.history,
             full=config.perception == "full",
-            tracks=new_tracks(count, config.observation.spin_expected) if is_tracked else play.NO_TRACKS,
+            tracks=new_tracks(count, config.observation.spin_expected)
+            if config.observation.is_tracked
+            else play.NO_TRACKS,
             reviewed=self._review is not None,
             path_rows=path_rows,
         )
@@ -312,19 +313,8 @@ class RallyEnv:
 
     def _observe(self, rows: Rows) -> None:
         """Write the observations of ``rows``."""
-        options, robot = self.config.observation, self.robot
-        is_privileged = options.critic == "privileged"
-        play.observe(
-            self._rallies,
-            rows,
-            robot.joint_pos,
-            robot.joint_vel,
-            _TOLD[options.spin],
-            options.prediction,
-            options.age,
-            is_privileged,
-            self._obs,
-        )
+        robot = self.robot
+        play.observe(self._rallies, rows, robot.joint_pos, robot.joint_vel, self._told, self._obs)
 
     def _finish(self, rows: Rows) -> FinishedRallies:
         r = self._rallies

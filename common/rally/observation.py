@@ -34,6 +34,12 @@ OBSERVATION: tuple[Part, ...] = (
 )
 """The paper's observation, in its order (it prints "racket position (7)"; only 3 sums to 37)."""
 
+_FILTERED: Final = {
+    "ball_pos": "where the ball is now, as its flight so far tells",
+    "ball_vel": "its velocity now",
+}
+"""Option ``ball: filtered``: what stands there then."""
+
 SPIN: tuple[Part, ...] = (
     Part("ball_spin", 3, "rad/s", -1500.0, 1500.0, "the ball's true spin: no robot is told it"),
 )
@@ -52,8 +58,8 @@ SPIN_ESTIMATE: tuple[Part, ...] = (
 """Option ``spin: estimated``: what a robot can find out by itself."""
 
 PREDICTION: tuple[Part, ...] = (
-    Part("present_ball_pos", 3, "m", -4.0, 4.0, "where the ball is now, as its flight so far tells"),
-    Part("present_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity now"),
+    Part("present_ball_pos", 3, "m", -4.0, 4.0, _FILTERED["ball_pos"]),
+    Part("present_ball_vel", 3, "m/s", -40.0, 40.0, _FILTERED["ball_vel"]),
     Part("meeting_in", 1, "s", -2.5, 1.2, "time until 0.12 s behind the bounce, about when it will be met"),
     Part("meeting_ball_pos", 3, "m", -8.0, 4.0, "where the ball will be then"),
     Part("meeting_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity then"),
@@ -126,15 +132,20 @@ class ObservationConfig(BaseModel):
     history: int = Field(
         0, ge=0, le=32, description="earlier ball samples that the policy sees, one a control step"
     )
+    ball: Literal["sampled", "filtered"] = Field(
+        "sampled",
+        description="the ball's position and velocity among the paper's 37: its newest sample, late and noisy, or what "
+        "all samples together say of where it is now",
+    )
     spin: Literal["hidden", "estimated", "true"] = Field(
         "estimated",
         description="the ball's spin as the policy is told it: not at all, as its flight tells (prediction.py), or "
         "the truth: a ceiling, nothing for a robot",
     )
-    spin_expected: Literal["mild", "strong"] = Field(
+    spin_expected: Literal["mild", "mixed", "strong"] = Field(
         "mild",
-        description="how fast balls are expected to spin: to 100 or to 300 rad/s. What a flight hides, for lift "
-        "saturates, is taken from that",
+        description="how fast balls are expected to spin: to 100 rad/s, half of them to 300, or all of them to 300. "
+        "A flight hides it, for lift saturates",
     )
     prediction: bool = Field(
         True,
@@ -149,6 +160,11 @@ class ObservationConfig(BaseModel):
         description="what the critic sees: what the policy does, or the simulator's truth besides",
     )
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether a policy sees anything that is made of all samples since the launch."""
+        return self.ball == "filtered" or self.spin == "estimated" or self.prediction
+
 
 PAPER_OBSERVATION = ObservationConfig(history=0, spin="hidden", prediction=False, age=False, critic="policy")
 """The paper's: 37 numbers for policy and critic alike."""
@@ -160,9 +176,13 @@ def policy_layout(config: ObservationConfig) -> tuple[Part, ...]:
         part._replace(name=f"{part.name}_{k}") for k in range(1, config.history + 1) for part in EARLIER
     )
     spin = {"hidden": (), "estimated": SPIN_ESTIMATE, "true": SPIN}[config.spin]
-    return (
-        OBSERVATION + spin + (PREDICTION if config.prediction else ()) + (AGE if config.age else ()) + earlier
+    paper = tuple(
+        part._replace(meaning=_FILTERED[part.name])
+        if config.ball == "filtered" and part.name in _FILTERED
+        else part
+        for part in OBSERVATION
     )
+    return paper + spin + (PREDICTION if config.prediction else ()) + (AGE if config.age else ()) + earlier
 
 
 def critic_layout(config: ObservationConfig) -> tuple[Part, ...]:
@@ -197,7 +217,8 @@ def markdown() -> str:
     lines += [
         "",
         "The first 37 are the paper's; the others are options, each explained below. A policy's contract.json names",
-        "its own. All are raw numbers: the normaliser comes with the policy.",
+        "its own. All are raw numbers: the normaliser comes with the policy. With option ball filtered, 24-29 say where",
+        "the ball is now, as present_ball_pos and present_ball_vel do.",
     ]
     tables = (
         ("The paper's", OBSERVATION),

@@ -55,7 +55,7 @@ class Observer:
         self._options = options
         self._noise = position_noise, velocity_noise
         self._rally, _ = play.allocate(1, options.history, tracks=new_tracks(1, options.spin_expected))
-        self._spin = play.SPIN_ESTIMATED if options.spin == "estimated" else play.SPIN_HIDDEN
+        self._told = play.told(options)._replace(is_privileged=False)
         self._is_first = True
 
     def begin(self, target: tuple[float, float]) -> None:
@@ -90,10 +90,7 @@ class Observer:
             np.zeros(1, np.int64),
             np.array(joint_pos, np.float64).reshape(1, 7),
             np.array(joint_vel, np.float64).reshape(1, 7),
-            self._spin,
-            self._options.prediction,
-            self._options.age,
-            False,
+            self._told,
             obs,
         )
         own: Floats = obs[0]

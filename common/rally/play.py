@@ -31,6 +31,7 @@ from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at,
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit, note_leaving
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
+from common.rally.observation import ObservationConfig
 from common.rally.prediction import PREDICTED, PRESENT, SPIN, begin_track, follow, new_tracks, predict
 from common.rally.trajectory import OUTCOME_OFFSET, Outcome, State
 
@@ -43,7 +44,6 @@ CONTACT_FORCE_SCALE = 50.0  # [N] F_c at which a body's collision penalty satura
 MAX_SPEED_REWARDED = 10.0  # [m/s]
 FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
-SPIN_HIDDEN, SPIN_ESTIMATED, SPIN_TRUE = 0, 1, 2
 NO_SAMPLE = -1.0  # state of a sample that is none: a path ends before it
 NO_TRACKS: Final = new_tracks(0)
 FEWEST_SHOTS = 12  # of the camera, before what the estimator makes of them is followed
@@ -52,6 +52,31 @@ _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed be
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
 _RETURNED, _TIME_OUT = int(Outcome.RETURNED), int(Outcome.TIME_OUT)
 _CAMERA = int(Stream.CAMERA)
+
+
+class Told(NamedTuple):
+    """What an observation says of the ball and of the truth: ``ObservationConfig`` for kernels."""
+
+    is_filtered: bool  # the ball stands where it is now, else where it was sampled
+    spin: int  # of ``_SPINS``
+    is_predicted: bool  # where it is now and how it will come to be met follow
+    has_age: bool  # how old its sample is follows
+    is_privileged: bool  # the critic's truth follows
+
+
+_SPINS = ("hidden", "estimated", "true")
+_SPIN_HIDDEN, _SPIN_TRUE = _SPINS.index("hidden"), _SPINS.index("true")
+
+
+def told(options: ObservationConfig) -> Told:
+    """Return what policy and critic are told."""
+    return Told(
+        is_filtered=options.ball == "filtered",
+        spin=_SPINS.index(options.spin),
+        is_predicted=options.prediction,
+        has_age=options.age,
+        is_privileged=options.critic == "privileged",
+    )
 
 
 class Rallies(NamedTuple):
@@ -675,10 +700,7 @@ def observe(
     rows: Integers,
     joint_pos: Array,
     joint_vel: Array,
-    spin: int,
-    predicted: bool,
-    age: bool,
-    privileged: bool,
+    told: Told,
     out: npt.NDArray[np.float32],
 ) -> None:
     """Write ``observation.critic_layout`` of ``rows`` (n,) into the same rows of ``out`` (B, D).
@@ -688,10 +710,7 @@ def observe(
         rows: Which.
         joint_pos: Joint positions now (B, 7).
         joint_vel: Joint velocities now (B, 7).
-        spin: Which the policy is told: ``SPIN_HIDDEN``, ``SPIN_ESTIMATED`` or ``SPIN_TRUE``.
-        predicted: Whether it is told where the ball is now and how it will come to be met.
-        age: Whether it is told how old its sample is.
-        privileged: Whether the critic's truth follows.
+        told: What of the ball stands in them.
         out: Rows to write.
     """
     for k in range(rows.shape[0]):
@@ -709,29 +728,29 @@ def observe(
         for j in range(4):
             o[17 + j] = quaternion[j]
         for j in range(6):
-            o[24 + j] = rallies.seen[b, j]
+            o[24 + j] = rallies.track[b, PRESENT + j] if told.is_filtered else rallies.seen[b, j]
         o[30], o[31] = rallies.condition[b, 8], rallies.condition[b, 9]
         s = int(rallies.seen[b, 6])
         o[32] = 2.0 * s / 3.0 - 1.0
         for j in range(4):
             o[33 + j] = 1.0 if j == s else 0.0
         at = 37
-        if spin != SPIN_HIDDEN:
+        if told.spin != _SPIN_HIDDEN:
             for j in range(3):
-                o[at + j] = rallies.ball[b, 6 + j] if spin == SPIN_TRUE else rallies.track[b, SPIN + j]
+                o[at + j] = rallies.ball[b, 6 + j] if told.spin == _SPIN_TRUE else rallies.track[b, SPIN + j]
             at += 3
-        if predicted:
+        if told.is_predicted:
             for j in range(PREDICTED):
                 o[at + j] = rallies.track[b, PRESENT + j]
             at += PREDICTED
-        if age:
+        if told.has_age:
             o[at] = rallies.clock[b] * GRID_STEP - rallies.seen[b, _TAKEN]
             at += 1
         for earlier in range(rallies.earlier.shape[1]):
             for j in range(6):
                 o[at + j] = rallies.earlier[b, earlier, j]
             at += 6
-        if privileged:
+        if told.is_privileged:
             for j in range(9):
                 o[at + j] = rallies.ball[b, j]
             for j in range(8):  # drag, lift, table, rubber

@@ -13,15 +13,15 @@ sample. Gaussian priors say how large each may be; what doesn't show, spin along
 
 At the bounce what is known is taken through the table's law: ten points of equal weight stand for spin, restitution and
 friction as uncertain as they are (cubature; Arasaratnam, Haykin 2009), and the mean and covariance of what becomes of
-them are the prior of the fit that begins there. So a velocity that the bounce wasn't expected to lead to tells of the
-spin: after a rolling one all that lies in the table's plane, after a sliding one its direction.
+them are the prior of the fit that begins there. How the velocity that is then seen differs from the one before it tells
+of the spin, by more than a Gaussian can say: ``bounce_spin``.
 
 The prediction is the nominal flight from there on, through an average table's bounce, to ``MEETING_AFTER`` behind it.
 """
 
 import math
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,13 @@ from common.physics.constants import AIR_FACTOR, BALL_RADIUS
 from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_MAX, SIMPLE_LIFT_SLOPE, flight_step
 from common.physics.table_bounce import table_bounce
 from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, vec_at
+from common.rally.bounce_spin import (
+    POINTS,
+    TABLE_FRICTION_MEAN,
+    TABLE_FRICTION_SIGMA,
+    shown_likelihood,
+    spin_behind_bounce,
+)
 from common.rally.cholesky import factor, inverse, substitute
 
 Array = npt.NDArray[np.float64]
@@ -53,8 +60,16 @@ RIGHT = NORMAL + UNKNOWNS * UNKNOWNS  # right side (10)
 PRESENT = RIGHT + UNKNOWNS  # position [m] and velocity [m/s] now (6)
 MEETING = PRESENT + 6  # in how long [s], position [m] and velocity [m/s] then (7)
 SPIN = MEETING + 7  # spin behind the bounce [rad/s] (3)
-FACTOR, FACTOR_SIGMA = SPIN + 3, SPIN + 4  # of ``EXPECTED``: given, and the row's for good
-TRACK = SPIN + 5  # numbers in a row
+# What the flight before the bounce showed, for ``bounce_spin``
+FORESEEN = SPIN + 3  # 1: the bounce came as foreseen, so that it tells of the spin
+BEFORE = FORESEEN + 1  # velocity before it [m/s] (3)
+PULL, AGREE = BEFORE + 3, BEFORE + 6  # ``shown_likelihood`` (3), (3, 3)
+GUESS = AGREE + 9  # guess at the velocity behind it, with which the fit begins anew [m/s] (3)
+GUESS_INFORMATION = GUESS + 3  # its inverse covariance along the table, xx, xy, yy [s^2/m^2]
+# ``Expected``: given, and the row's for good
+FACTOR, FACTOR_SIGMA = GUESS_INFORMATION + 3, GUESS_INFORMATION + 4
+USUAL = GUESS_INFORMATION + 5  # mild, inner, outer (3)
+TRACK = USUAL + 3  # numbers in a row
 PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and meeting
 
 MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
@@ -65,18 +80,34 @@ MOST_DRAG = 0.5  # [-] that a drag factor is believed to be off
 LEAST_POSITION_NOISE = 0.001  # [m] that samples are taken to have at least: the model isn't perfect either
 LEAST_VELOCITY_NOISE = 0.02  # [m/s]
 TABLE_RESTITUTION0_MEAN, TABLE_RESTITUTION0_SIGMA = 0.975, 0.0144  # [-] of the tables of profile `standard`
-TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-]
 BOUNCE_PLACE_SIGMA = 0.006  # [m] a axis: where the bounce was, as foreseen
 BOUNCE_SPEED_SIGMA = 0.05  # [m/s] a axis: with what velocity
+BEFORE_SIGMA = 0.03  # [m/s] a axis: with what velocity the ball came to it
 BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
-# Lift saturates (at 62 rad/s and 5 m/s): how fast a ball spins by what its flight shows, mean and sigma [-], is a
-# matter of what balls are expected. Measured at the bounce of `paper` and `strong` balls: 1.2, 3.3
-EXPECTED: Final[Mapping[str, tuple[float, float]]] = {"mild": (1.2, 0.2), "strong": (3.3, 1.0)}
+
+
+class Expected(NamedTuple):
+    """What spins are expected, for a flight hides how fast a ball spins once its lift is saturated."""
+
+    factor: float  # [-] by how much faster it spins than the flight shows, until the bounce tells more
+    sigma: float  # [-] of that
+    mild: float  # share of balls whose spin is uniform in the inner sphere; the others' is in the outer one
+    inner: float  # [rad/s]
+    outer: float  # [rad/s]
+
+
+EXPECTED: Final[Mapping[str, Expected]] = {
+    # factors as measured at the bounce of balls of the presets `paper`, `mixed` and `strong`
+    "mild": Expected(1.2, 0.2, 1.0, 100.0, 100.0),
+    "mixed": Expected(2.0, 0.8, 0.5, 100.0, 300.0),
+    "strong": Expected(3.3, 1.0, 0.0, 300.0, 300.0),
+}
 _LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
 _SATURATION = SIMPLE_LIFT_MAX / (
     SIMPLE_LIFT_SLOPE * BALL_RADIUS
 )  # [1/m] of spin by speed, from which on lift is saturated
 _DRAG_FACTOR = AIR_FACTOR * SIMPLE_DRAG
+_LEAST_INFORMATION = 1.0  # [s^2/m^2] that samples have on a velocity
 _STEP = 0.020  # [s] of the flight that is foretold: Runge-Kutta errs by less than 0.01 mm in it
 _LONGEST = 1.0  # [s] farther ahead nothing is foretold
 _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not foreseen
@@ -85,7 +116,7 @@ _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not
 def new_tracks(count: int, expected: str = "mild") -> Array:
     """Return rows (count, TRACK) for balls that are expected to spin as ``EXPECTED`` says."""
     tracks = np.zeros((count, TRACK))
-    tracks[:, [FACTOR, FACTOR_SIGMA]] = EXPECTED[expected]
+    tracks[:, FACTOR:] = EXPECTED[expected]
     return tracks
 
 
@@ -167,6 +198,77 @@ def _advance(track: Array, h: float) -> None:
 
 
 @kernel
+def _believed(spin: Vec) -> Vec:
+    """Return the spin, or as much of it as is believed: bad samples must not lead beyond all bounds."""
+    return scale(min(1.0, MOST_SPIN / max(norm(spin), 1.0)), spin)
+
+
+@kernel
+def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
+    """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
+    found = track[FOUND:NORMAL]
+    dw = scale(SPIN_SIGMA, vec_at(found, _SPIN))
+    share, hidden = _saturation(track)
+    lifting = _shown(share * _LIFT, hidden, dw)
+    k = DRAG_SIGMA * found[_DRAG]
+    pos = add(vec_at(track, POS), axpy(track[LEFT_PATH], vec_at(found, _DV), vec_at(found, 0)))
+    pos = axpy(k, vec_at(track, SLOWED_PATH), add(pos, cross(lifting, vec_at(track, PATH))))
+    vel = axpy(track[LEFT], vec_at(found, _DV), vec_at(track, VEL))
+    vel = axpy(k, vec_at(track, SLOWED), add(vel, cross(lifting, vec_at(track, WAY))))
+    spin = add(vec_at(track, NOMINAL_SPIN), dw)
+    return pos, vel, _believed(spin), min(max(track[NOMINAL_DRAG] + k, 1.0 - MOST_DRAG), 1.0 + MOST_DRAG)
+
+
+@kernel
+def _tell_spin(track: Array, lower: Array) -> None:
+    """Write the spin behind the bounce, as samples from there tell it (``bounce_spin``).
+
+    Args:
+        track: Written.
+        lower: Cholesky factor of its normal matrix.
+    """
+    unit, column = np.zeros(UNKNOWNS), np.empty(UNKNOWNS)
+    unit[_DV] = 1.0
+    substitute(lower, unit, column)
+    xx, xy = column[_DV], column[_DV + 1]
+    unit[_DV], unit[_DV + 1] = 0.0, 1.0
+    substitute(lower, unit, column)
+    yy = column[_DV + 1]
+    # The samples alone: the fit's information on the velocity along the table, less that of the guess it began with
+    det = xx * yy - xy * xy
+    dx, dy = track[FOUND + _DV], track[FOUND + _DV + 1]
+    pull_x, pull_y = (yy * dx - xy * dy) / det, (xx * dy - xy * dx) / det
+    info_xx = max(yy / det - track[GUESS_INFORMATION], _LEAST_INFORMATION)
+    info_yy = max(xx / det - track[GUESS_INFORMATION + 2], _LEAST_INFORMATION)
+    most = 0.9 * math.sqrt(info_xx * info_yy)
+    info_xy = min(max(-xy / det - track[GUESS_INFORMATION + 1], -most), most)
+    det = info_xx * info_yy - info_xy * info_xy
+    xx, xy, yy = info_yy / det, -info_xy / det, info_xx / det
+    before, guess = vec_at(track, BEFORE), vec_at(track, GUESS)
+    change = (
+        guess[0] + xx * pull_x + xy * pull_y - before[0],
+        guess[1] + xy * pull_x + yy * pull_y - before[1],
+        guess[2] + track[FOUND + _DV + 2] - before[2],
+    )
+    error_xx = math.sqrt(xx + BEFORE_SIGMA * BEFORE_SIGMA)
+    error_yx = xy / error_xx
+    error_yy = math.sqrt(yy + BEFORE_SIGMA * BEFORE_SIGMA - error_yx * error_yx)
+    _, _, otherwise, _ = _estimate(track)
+    spin = spin_behind_bounce(
+        before,
+        change,
+        (error_xx, error_yx, error_yy),
+        vec_at(track, PULL),
+        track[AGREE:GUESS].reshape(3, 3),
+        _SATURATION * norm(before),
+        vec_at(track, USUAL),
+        otherwise,
+        POINTS,
+    )
+    track[SPIN], track[SPIN + 1], track[SPIN + 2] = _believed(spin)
+
+
+@kernel
 def _take(track: Array, seen: Array, moment: float, position_noise: float, velocity_noise: float) -> None:
     """Add a sample to the fit, and solve it."""
     _advance(track, moment - track[MOMENT])
@@ -192,24 +294,8 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
     lower = np.empty((UNKNOWNS, UNKNOWNS))
     factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
     substitute(lower, track[RIGHT:PRESENT], track[FOUND:NORMAL])
-
-
-@kernel
-def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
-    """Return position, velocity, spin and drag factor at the last sample, as the fit has them."""
-    found = track[FOUND:NORMAL]
-    dw = scale(SPIN_SIGMA, vec_at(found, _SPIN))
-    share, hidden = _saturation(track)
-    lifting = _shown(share * _LIFT, hidden, dw)
-    k = DRAG_SIGMA * found[_DRAG]
-    pos = add(vec_at(track, POS), axpy(track[LEFT_PATH], vec_at(found, _DV), vec_at(found, 0)))
-    pos = axpy(k, vec_at(track, SLOWED_PATH), add(pos, cross(lifting, vec_at(track, PATH))))
-    vel = axpy(track[LEFT], vec_at(found, _DV), vec_at(track, VEL))
-    vel = axpy(k, vec_at(track, SLOWED), add(vel, cross(lifting, vec_at(track, WAY))))
-    spin = add(vec_at(track, NOMINAL_SPIN), dw)
-    # Bad samples must not send the prediction beyond all bounds
-    spin = scale(min(1.0, MOST_SPIN / max(norm(spin), 1.0)), spin)
-    return pos, vel, spin, min(max(track[NOMINAL_DRAG] + k, 1.0 - MOST_DRAG), 1.0 + MOST_DRAG)
+    if track[FORESEEN] == 1.0:
+        _tell_spin(track, lower)
 
 
 @kernel
@@ -352,6 +438,8 @@ def follow(
         surprises = abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0
         if surprises:
             then = (seen[3], seen[4], -abs(seen[5]))
+        showing = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN:_DRAG, _SPIN:_DRAG]
+        shown_likelihood(spin, showing, SPIN_SIGMA, track[PULL:AGREE], track[AGREE:GUESS].reshape(3, 3))
         covariance = np.empty((6, 6))
         vel, spin = _through_bounce(then, spin, track[FACTOR], track[FACTOR_SIGMA], variance, covariance)
         if surprises:  # where and how fast the ball is is what the sample says
@@ -360,6 +448,15 @@ def follow(
             covariance[:, :3] = 0.0
             for k in range(3):
                 covariance[k, k] = max(velocity_noise, LEAST_VELOCITY_NOISE) ** 2
+        det = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
+        track[GUESS_INFORMATION], track[GUESS_INFORMATION + 2] = (
+            covariance[1, 1] / det,
+            covariance[0, 0] / det,
+        )
+        track[GUESS_INFORMATION + 1] = -covariance[0, 1] / det
+        for k in range(3):
+            track[BEFORE + k], track[GUESS + k] = then[k], vel[k]
+        track[FORESEEN] = 0.0 if surprises else 1.0
         _begin_anew(track, at, there, vel, spin, covariance, drag, variance[_DRAG, _DRAG])
     _take(track, seen, moment, position_noise, velocity_noise)
 
@@ -398,4 +495,5 @@ def predict(track: Array, now: float) -> None:
     for k in range(3):
         track[PRESENT + k], track[PRESENT + 3 + k] = here[k], speed[k]
         track[MEETING + 1 + k], track[MEETING + 4 + k] = there[k], then[k]
-        track[SPIN + k] = spin[k]
+        if track[FORESEEN] == 0.0:
+            track[SPIN + k] = spin[k]

@@ -42,10 +42,7 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
         np.array([0]),
         np.array([joints]),
         np.array([rates]),
-        spin=play.SPIN_HIDDEN,
-        predicted=False,
-        age=False,
-        privileged=False,
+        told=play.told(PAPER_OBSERVATION),
         out=out,
     )
     return out[0]
@@ -201,6 +198,26 @@ def test_the_spin_as_estimated_the_prediction_and_the_samples_age_stand_behind_t
 
     assert np.abs(obs[:, at["spin_estimate"]]).max() > 1.0
     assert np.min(ages) >= 0.0099  # the camera's latency, 10 to 40 ms; more where a sample was lost
+
+
+def test_a_filtered_ball_stands_in_the_papers_place_for_it():
+    paper = {"spin": "hidden", "prediction": False, "age": False, "critic": "policy"}
+    config = ObservationConfig(ball="filtered", **paper)
+    filtered, truth = played(config)
+    sampled, _ = played(PAPER_OBSERVATION)
+    told, _ = played(ObservationConfig(critic="policy"))
+    at = offsets(policy_layout(ObservationConfig()))
+    present = np.r_[at["present_ball_pos"], at["present_ball_vel"]]
+
+    assert size(policy_layout(config)) == 37
+    np.testing.assert_array_equal(filtered[:, 24:30], told[:, present])
+    np.testing.assert_array_equal(np.delete(filtered, np.s_[24:30], 1), np.delete(sampled, np.s_[24:30], 1))
+    off, off_sampled = (
+        np.linalg.norm(obs[4:, 24:27] - truth[4:, :3], axis=1).max() for obs in (filtered, sampled)
+    )
+    assert off < 0.02
+    assert off_sampled > 0.1
+    assert "now" in policy_layout(config)[5].meaning
 
 
 def test_the_critic_sees_the_truth_and_the_policys_numbers_stay_as_they_are():

@@ -34,6 +34,7 @@ def target_of(env: RallyEnv) -> tuple[float, float]:
         {},
         {"history": 2},
         {"spin": "hidden", "prediction": False, "age": False},
+        {"ball": "filtered", "spin": "hidden", "prediction": False, "age": False},
         {"spin_expected": "strong", "history": 1, "age": False},
     ],
 )

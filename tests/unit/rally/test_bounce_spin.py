@@ -1,0 +1,165 @@
+"""The spin behind a bounce is Bayes' rule: balls drawn by the hundred thousand, bounced and weighed, say the same."""
+
+import numpy as np
+import pytest
+
+from common.physics.table_bounce import table_bounce
+from common.rally.bounce_spin import POINTS, density, quasi_random, shown_likelihood, spin_behind_bounce
+
+UP = (0.0, 0.0, 1.0)
+COMING = (-5.0, 0.8, -2.5)
+SATURATED = 64.0  # rad/s
+MILD, MIXED, STRONG = (1.0, 100.0, 100.0), (0.5, 100.0, 300.0), (0.0, 300.0, 300.0)
+SHOWN_SIGMA = 18.0  # rad/s
+ERROR = 0.05  # m/s
+NOWHERE = (1e6, 1e6, 1e6)
+MANY = quasi_random(20_000)
+BALLS = 300_000
+
+
+def in_sphere(count, radius, rng) -> np.ndarray:
+    ways = rng.standard_normal((count, 3))
+    return radius * rng.random((count, 1)) ** (1 / 3) * ways / np.linalg.norm(ways, axis=1, keepdims=True)
+
+
+def shows(spins: np.ndarray) -> np.ndarray:
+    rate = np.linalg.norm(spins, axis=-1, keepdims=True)
+    return spins * np.minimum(rate, SATURATED) / rate
+
+
+def told(spin, friction=0.25) -> tuple:
+    """Return what a ball of this spin shows: change of velocity, pull and agree."""
+    rising, _ = table_bounce(COMING, spin, UP, 0.975, friction)
+    agree = np.eye(3) / SHOWN_SIGMA**2
+    return tuple(np.subtract(rising, COMING)), tuple(agree @ shows(np.array(spin))), agree
+
+
+def found(spin, usual, points, friction=0.25, error=ERROR) -> np.ndarray:
+    change, pull, agree = told(spin, friction)
+    errors = (error, 0.0, error)
+    return np.array(
+        spin_behind_bounce(COMING, change, errors, pull, agree, SATURATED, usual, NOWHERE, points)
+    )
+
+
+def drawn(spin, usual, friction=0.25) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and sigma of the spin behind the bounce among all balls that agree with what was told."""
+    rng = np.random.default_rng(0)
+    mild, inner, outer = usual
+    radius = np.where(rng.random((BALLS, 1)) < mild, inner, outer)
+    spins, frictions = in_sphere(BALLS, radius, rng), rng.normal(0.25, 0.029, BALLS)
+    change, pull, agree = told(spin, friction)
+    behind = np.array(
+        [
+            np.concatenate(table_bounce(COMING, tuple(w), UP, 0.975, mu))
+            for w, mu in zip(spins, frictions, strict=True)
+        ]
+    )
+    off = (behind[:, :2] - COMING[:2] - change[:2]) / ERROR
+    s = shows(spins)
+    logs = s @ pull - 0.5 * np.einsum("ni,ij,nj->n", s, agree, s) - 0.5 * (off**2).sum(axis=1)
+    weights = np.exp(logs - logs.max())
+    mean = np.average(behind[:, 3:], axis=0, weights=weights)
+    assert weights.sum() ** 2 / (weights**2).sum() > 150.0  # enough of them agree
+    return mean, np.sqrt(np.average((behind[:, 3:] - mean) ** 2, axis=0, weights=weights))
+
+
+CASES = [
+    ((20.0, -50.0, 30.0), MILD),  # slides
+    ((10.0, -200.0, 60.0), STRONG),  # topspin: rolls
+    ((10.0, 120.0, -150.0), STRONG),  # backspin: slides
+    ((-120.0, -40.0, 180.0), STRONG),
+    ((20.0, -50.0, 60.0), MIXED),
+    ((30.0, -160.0, 120.0), MIXED),
+]
+
+
+@pytest.mark.parametrize(("spin", "usual"), CASES)
+def test_it_is_the_mean_of_all_balls_that_agree(spin, usual):
+    mean, sigma = drawn(spin, usual)
+
+    assert (np.abs(found(spin, usual, MANY) - mean) < 0.2 * sigma + 1.0).all()
+
+
+@pytest.mark.parametrize(("spin", "usual"), CASES)
+def test_few_points_do(spin, usual):
+    mean, sigma = drawn(spin, usual)
+
+    assert (np.abs(found(spin, usual, POINTS) - mean) < 0.6 * sigma + 1.0).all()
+
+
+def test_a_rolling_bounce_tells_the_spin_in_the_tables_plane():
+    """However strong it is, and without the flight's help."""
+    spin = (-90.0, -210.0, 40.0)
+    _, behind = table_bounce(COMING, spin, UP, 0.975, 0.25)
+
+    np.testing.assert_allclose(found(spin, STRONG, MANY, error=0.005)[:2], behind[:2], atol=4.0)
+
+
+def test_a_sliding_bounce_tells_the_spins_direction():
+    """Mirror images of a spin that the flight can't tell apart, left and right of it, it does."""
+    left, right = (found((side * 150.0, 100.0, 0.0), STRONG, MANY) for side in (-1, 1))
+
+    assert left[0] < -60.0
+    assert right[0] > 60.0
+
+
+def test_the_sign_of_the_sidespin_is_the_flights():
+    """Where nothing is told of it, there is as much of one as of the other: none, on average."""
+    told_so = found((0.0, 100.0, 150.0), STRONG, MANY)
+    change, pull, agree = told((0.0, 100.0, 150.0))
+    agree[2, 2] = 1e-8
+    hidden = spin_behind_bounce(
+        COMING,
+        change,
+        (ERROR, 0.0, ERROR),
+        (pull[0], pull[1], 0.0),
+        agree,
+        SATURATED,
+        STRONG,
+        NOWHERE,
+        MANY,
+    )
+
+    assert told_so[2] > 80.0
+    assert abs(hidden[2]) < 15.0
+
+
+@pytest.mark.parametrize("usual", [MILD, MIXED, STRONG])
+def test_densities_are_of_the_outer_spheres_balls(usual):
+    rate = np.linspace(0.5, 399.5, 400)
+    dense = np.array([density(r, *usual) for r in rate])
+
+    assert (4 * np.pi * rate**2 * dense).sum() == pytest.approx(4 / 3 * np.pi * usual[2] ** 3, rel=0.02)
+
+
+def test_what_a_flight_says_is_the_estimate_less_its_prior_with_the_lift_factors_spread():
+    rows = np.random.default_rng(0).standard_normal((3, 6))
+    alone, shown = 60.0 * rows @ rows.T, np.array([20.0, -50.0, 30.0])
+    prior = np.eye(3) / 50.0**2
+    covariance = np.linalg.inv(np.linalg.inv(alone) + prior)
+    by_itself = alone @ np.linalg.solve(covariance, shown)  # whose mean with the prior is the estimate
+    pull, agree = np.empty(3), np.empty((3, 3))
+    shown_likelihood(tuple(shown), covariance, 50.0, pull, agree)
+    wider = alone + 0.115**2 * np.outer(shown, shown)
+
+    np.testing.assert_allclose(agree, np.linalg.inv(wider), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(pull, np.linalg.solve(wider, by_itself), rtol=1e-9)
+
+
+def test_where_nothing_agrees_it_says_what_it_was_given():
+    """A ball without velocity: no lift could have shown anything."""
+    change, pull, agree = told((20.0, -50.0, 30.0))
+    agree[:] = 1e12
+    spin = spin_behind_bounce(
+        (0.0, 0.0, 0.0), change, (ERROR, 0.0, ERROR), pull, agree, 0.0, MILD, (1.0, 2.0, 3.0), POINTS
+    )
+
+    assert spin == (1.0, 2.0, 3.0)
+
+
+def test_points_are_spread_evenly():
+    for column, (low, high) in enumerate([(-0.15, 0.15), (-0.15, 0.15), (0.45, 0.55), (-0.15, 0.15)]):
+        assert low < POINTS[:, column].mean() < high
+    assert POINTS[:, [0, 1, 3]].std(axis=0) == pytest.approx(np.ones(3), abs=0.15)
+    assert len(np.unique(POINTS.round(6), axis=0)) == len(POINTS)
