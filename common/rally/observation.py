@@ -217,8 +217,8 @@ def markdown() -> str:
     lines += [
         "",
         "The first 37 are the paper's; the others are options, each explained below. A policy's contract.json names",
-        "its own. All are raw numbers: the normaliser comes with the policy. With option ball filtered, 24-29 say where",
-        "the ball is now, as present_ball_pos and present_ball_vel do.",
+        "its own. All are raw numbers: the normaliser comes with the policy. With option ball filtered, 24-29 are",
+        "present_ball_pos and present_ball_vel.",
     ]
     tables = (
         ("The paper's", OBSERVATION),
