@@ -22,8 +22,9 @@ from common.physics.table_bounce import table_bounce
 from common.rally.launch import LONGEST_FLIGHT, RallyBlock, draw_rallies
 from common.rally.launch_presets import PRESETS
 from common.rally.noise import PROFILES
+from common.rally.observation import Expectation, ObservationConfig
 from common.rally.play import SAMPLE
-from common.rally.prediction import MEETING, MEETING_AFTER, PRESENT, SPIN
+from common.rally.prediction import EXPECTED, MEETING, MEETING_AFTER, PRESENT, SPIN
 from common.rally.trajectory import State
 
 Array = npt.NDArray[np.float64]
@@ -47,10 +48,13 @@ def truth(block: RallyBlock, conditions: Array) -> tuple[Array, Array]:
     return bounce, meeting
 
 
-def watch(balls: int, preset: str, noise: str, seed: int) -> dict[int, Array]:
+def watch(balls: int, preset: str, noise: str, seed: int, expected: Expectation = "mild") -> dict[int, Array]:
     """Return errors by moment since the bounce [ms]: rows of present 6, meeting 6, spin 3, and the sample's own 6."""
     block = draw_rallies(balls, seed=seed, preset=preset, noise=noise)
-    env = RallyEnv(balls, EnvConfig(noise=noise, foresee=0.0, go_on=0.0), MemoryRallies(block))
+    config = EnvConfig(
+        noise=noise, foresee=0.0, go_on=0.0, observation=ObservationConfig(spin_expected=expected)
+    )
+    env = RallyEnv(balls, config, MemoryRallies(block))
     env.reset()
     rallies, hold = env.rallies, np.tile(env.home_action, (balls, 1))
     bounce, meeting = truth(block, rallies.condition)
@@ -107,6 +111,12 @@ def main() -> None:
     )
     parser.add_argument("--balls", type=int, default=2000, help="how many, 100 or more (default 2000)")
     parser.add_argument("--launch", choices=PRESETS, default="paper", help="launch preset (default paper)")
+    parser.add_argument(
+        "--spin-expected",
+        choices=EXPECTED,
+        default="mild",
+        help="env.observation.spin_expected (default mild)",
+    )
     parser.add_argument("--noise", choices=PROFILES, default="standard", help="profile (default standard)")
     parser.add_argument("--seed", type=int, default=0, help="of the balls (default 0)")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
@@ -115,9 +125,10 @@ def main() -> None:
         parser.error(f"--balls: got {options.balls}; allowed: 100 or more")
     if options.seed < 0:
         parser.error(f"--seed: got {options.seed}; allowed: 0 or more")
-    rows = figures(watch(options.balls, options.launch, options.noise, options.seed))
+    rows = figures(watch(options.balls, options.launch, options.noise, options.seed, options.spin_expected))
     if options.json:
-        print(json.dumps({"launch": options.launch, "noise": options.noise, "by_moment": rows}))
+        about = {"launch": options.launch, "noise": options.noise, "spin_expected": options.spin_expected}
+        print(json.dumps(about | {"by_moment": rows}))
         return
     for row in rows:
         print("  ".join(f"{name} {value}" for name, value in row.items()))

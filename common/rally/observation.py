@@ -8,6 +8,8 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
+Expectation = Literal["mild", "mixed", "strong"]  # of spins: ``prediction.EXPECTED``
+
 
 class Part(NamedTuple):
     """A contiguous part of a vector."""
@@ -142,7 +144,7 @@ class ObservationConfig(BaseModel):
         description="the ball's spin as the policy is told it: not at all, as its flight tells (prediction.py), or "
         "the truth: a ceiling, nothing for a robot",
     )
-    spin_expected: Literal["mild", "mixed", "strong"] = Field(
+    spin_expected: Expectation = Field(
         "mild",
         description="how fast balls are expected to spin: to 100 rad/s, half of them to 300, or all of them to 300. "
         "A flight hides it, for lift saturates",

@@ -39,6 +39,7 @@ from common.rally.bounce_spin import (
     spin_behind_bounce,
 )
 from common.rally.cholesky import factor, inverse, substitute
+from common.rally.observation import Expectation
 
 Array = npt.NDArray[np.float64]
 
@@ -96,8 +97,8 @@ class Expected(NamedTuple):
     outer: float  # [rad/s]
 
 
-EXPECTED: Final[Mapping[str, Expected]] = {
-    # factors as measured at the bounce of balls of the presets `paper`, `mixed` and `strong`
+EXPECTED: Final[Mapping[Expectation, Expected]] = {
+    # factors of mild and strong as measured at the bounce of balls of the presets `paper` and `strong`
     "mild": Expected(1.2, 0.2, 1.0, 100.0, 100.0),
     "mixed": Expected(2.0, 0.8, 0.5, 100.0, 300.0),
     "strong": Expected(3.3, 1.0, 0.0, 300.0, 300.0),
@@ -113,7 +114,7 @@ _LONGEST = 1.0  # [s] farther ahead nothing is foretold
 _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not foreseen
 
 
-def new_tracks(count: int, expected: str = "mild") -> Array:
+def new_tracks(count: int, expected: Expectation = "mild") -> Array:
     """Return rows (count, TRACK) for balls that are expected to spin as ``EXPECTED`` says."""
     tracks = np.zeros((count, TRACK))
     tracks[:, FACTOR:] = EXPECTED[expected]
