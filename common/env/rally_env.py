@@ -246,8 +246,10 @@ class RallyEnv:
         return self._rallies
 
     def reset(self) -> Floats:
-        """Start every environment anew, robots at home; return the first observations (B, D)."""
+        """Start every environment anew, robots at home, against strangers; return the first observations (B, D)."""
         self._started = False
+        if self.config.observation.is_tracked:  # nothing is known of the other side
+            self._rallies.track[:] = new_tracks(self.count, self.config.observation.spin_expected)
         self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
         self._rallies.last_action[:] = self.robot.home_action
         self._begin(self._all, np.zeros(self.count, np.bool_))

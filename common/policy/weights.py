@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version as package_version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ from common.rally.observation import (
     ACTION_SIZE,
     OBSERVATION,
     PAPER_OBSERVATION,
+    Expectation,
     ObservationConfig,
     Part,
     critic_layout,
@@ -70,6 +71,13 @@ class Contract(BaseModel):
     frames: int
     measures: dict[str, Any] = {}
     made_with: dict[str, str] = {}
+
+    def expecting(self, spins: Expectation | Literal["contract"]) -> Self:
+        """Return the contract with other spins expected, whatever the policy was trained with; or as it is."""
+        if spins == "contract":
+            return self
+        options = self.observation_options.model_copy(update={"spin_expected": spins})
+        return self.model_copy(update={"observation_options": options})
 
 
 def _described(layout: tuple[Part, ...]) -> tuple[dict[str, Any], ...]:

@@ -9,7 +9,8 @@ With c the velocity of the ball's lowest point, it changes the velocity along th
 and neither tells of the sidespin. So spins are drawn that change the velocity as was seen, one for either kind of
 bounce at each of ``POINTS``: the change within its own error, |c| along its line, sidespin as the flight shows it. Each
 is weighed by its agreement with the flight, its friction's and its own density, over the density it was drawn with
-(importance sampling); their weighted mean is the answer.
+(importance sampling). Their weighted mean is the answer; and by how much of the weight is a mild ball's, the other side
+comes to be known.
 """
 
 import math
@@ -26,6 +27,7 @@ from common.rally.cholesky import factor, inverse
 
 Array = npt.NDArray[np.float64]
 
+INNER, OUTER = 100.0, 300.0  # [rad/s] radii of the spheres that mild and strong balls' spins are uniform in
 TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-] of the tables of profile `standard`
 _EDGE = 8.0  # [rad/s] spins thin out over this much about a sphere's edge
 _WIDER = 1.3  # by which sidespin is drawn wider than the flight's error, so that no weight is large
@@ -51,18 +53,14 @@ POINTS: Final = quasi_random(96)
 
 
 @kernel
-def density(rate: float, mild: float, inner: float, outer: float) -> float:
-    """Return how densely spins of ``rate`` lie, as a multiple of the density of spins uniform in the outer sphere.
+def densities(rate: float) -> tuple[float, float]:
+    """Return how densely spins of ``rate`` [rad/s] lie among mild balls, and among strong ones.
 
-    Args:
-        rate: [rad/s].
-        mild: Share of balls whose spin is uniform in the inner sphere; the others' is in the outer one.
-        inner: Radius [rad/s].
-        outer: Radius [rad/s].
+    Either's are uniform in a sphere of spins; the unit is the density in the larger.
     """
-    within_inner = min(max(0.5 + 0.5 * (inner - rate) / _EDGE, 0.0), 1.0)
-    within_outer = min(max(0.5 + 0.5 * (outer - rate) / _EDGE, _UNLIKELY), 1.0)
-    return mild * within_inner * (outer / inner) ** 3 + (1.0 - mild) * within_outer
+    within_inner = min(max(0.5 + 0.5 * (INNER - rate) / _EDGE, 0.0), 1.0)
+    within_outer = min(max(0.5 + 0.5 * (OUTER - rate) / _EDGE, _UNLIKELY), 1.0)
+    return within_inner * (OUTER / INNER) ** 3, within_outer
 
 
 @kernel
@@ -104,11 +102,11 @@ def spin_behind_bounce(
     pull: Vec,
     agree: Array,
     saturated: float,
-    usual: Vec,
+    mild: float,
     otherwise: Vec,
     points: Array,
-) -> Vec:
-    """Return the spin to be expected behind a bounce on the table [rad/s].
+) -> tuple[Vec, float]:
+    """Return the spin to be expected behind a bounce on the table [rad/s], and how likely the ball is a mild one.
 
     Args:
         before: Velocity before the bounce [m/s].
@@ -117,15 +115,15 @@ def spin_behind_bounce(
         pull: What the flight before it showed: ``shown_likelihood`` [s/rad].
         agree: (3, 3), of which the lower triangle is read [s^2/rad^2].
         saturated: Spin from which on lift is saturated [rad/s].
-        usual: ``density``'s mild, inner and outer.
+        mild: How likely it was one before.
         otherwise: Returned where nothing agrees [rad/s].
         points: ``quasi_random``'s; ``POINTS`` err by a fifth of what is left uncertain.
     """
     count = points.shape[0]
-    weights, logs, spins = np.zeros(2 * count), np.empty(2 * count), np.empty((2 * count, 3))
-    mild, inner, outer = usual
+    weights, milds = np.zeros(2 * count), np.zeros(2 * count)
+    logs, spins = np.empty(2 * count), np.empty((2 * count, 3))
     push = max(change[2], _LEAST_PUSH)  # (1 + e)|v_n|
-    fastest = outer + _EDGE
+    fastest = (OUTER if mild < 1.0 else INNER) + _EDGE
     own = agree[2, 2] + 1.0 / (_SHOWN_SIGMA * _SHOWN_SIGMA)
     wide = _WIDER / math.sqrt(own)
     top = -math.inf
@@ -176,19 +174,23 @@ def spin_behind_bounce(
                 - 0.5 * (agree[0, 0] * sx * sx + agree[1, 1] * sy * sy + agree[2, 2] * sz * sz)
                 - (agree[1, 0] * sx * sy + agree[2, 0] * sx * sz + agree[2, 1] * sy * sz)
             )
-            weights[i] = weight * density(rate, mild, inner, outer)
+            among_mild, among_strong = densities(rate)
+            milds[i] = weight * mild * among_mild
+            weights[i] = milds[i] + weight * max(1.0 - mild, _UNLIKELY) * among_strong
             top = max(top, logs[i])
             spins[i, 0] = wx + SPIN_PER_VELOCITY * dy
             spins[i, 1] = wy - SPIN_PER_VELOCITY * dx
             spins[i, 2] = wz
-    total, x, y, z = 0.0, 0.0, 0.0, 0.0
+    total, total_mild, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(2 * count):
         if weights[i] > 0.0:
-            weight = weights[i] * math.exp(logs[i] - top)
+            agreement = math.exp(logs[i] - top)
+            weight = weights[i] * agreement
             total += weight
+            total_mild += milds[i] * agreement
             x += weight * spins[i, 0]
             y += weight * spins[i, 1]
             z += weight * spins[i, 2]
     if not total > 0.0:
-        return otherwise
-    return (x / total, y / total, z / total)
+        return otherwise, mild
+    return (x / total, y / total, z / total), total_mild / total

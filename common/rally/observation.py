@@ -8,7 +8,7 @@ from typing import Final, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Expectation = Literal["mild", "mixed", "strong"]  # of spins: ``prediction.EXPECTED``
+Expectation = Literal["mild", "mixed", "strong", "learnt"]  # of spins: ``prediction.EXPECTED``
 
 
 class Part(NamedTuple):
@@ -146,8 +146,8 @@ class ObservationConfig(BaseModel):
     )
     spin_expected: Expectation = Field(
         "mild",
-        description="how fast balls are expected to spin: to 100 rad/s, half of them to 300, or all of them to 300. "
-        "A flight hides it, for lift saturates",
+        description="how fast balls are expected to spin, for lift saturates and hides it: to 100 rad/s, half of "
+        "them to 300, all of them to 300, or as the other side's earlier balls did",
     )
     prediction: bool = Field(
         True,

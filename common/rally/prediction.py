@@ -67,10 +67,12 @@ BEFORE = FORESEEN + 1  # velocity before it [m/s] (3)
 PULL, AGREE = BEFORE + 3, BEFORE + 6  # ``shown_likelihood`` (3), (3, 3)
 GUESS = AGREE + 9  # guess at the velocity behind it, with which the fit begins anew [m/s] (3)
 GUESS_INFORMATION = GUESS + 3  # its inverse covariance along the table, xx, xy, yy [s^2/m^2]
-# ``Expected``: given, and the row's for good
-FACTOR, FACTOR_SIGMA = GUESS_INFORMATION + 3, GUESS_INFORMATION + 4
-USUAL = GUESS_INFORMATION + 5  # mild, inner, outer (3)
-TRACK = USUAL + 3  # numbers in a row
+MILD = GUESS_INFORMATION + 3  # how likely the ball was a mild one before it was launched
+FACTOR, FACTOR_SIGMA = MILD + 1, MILD + 2  # so by how much faster it spins than its flight shows
+# ... and what a row keeps from ball to ball
+FIRST_MILD, RENEWED = MILD + 3, MILD + 4  # ``Expected``
+FOUND_MILD = MILD + 5  # how likely the last ball was a mild one
+TRACK = MILD + 6  # numbers in a row
 PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and meeting
 
 MEETING_AFTER = 0.12  # [s] behind the bounce: about when a racket meets the ball
@@ -90,19 +92,21 @@ BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
 class Expected(NamedTuple):
     """What spins are expected, for a flight hides how fast a ball spins once its lift is saturated."""
 
-    factor: float  # [-] by how much faster it spins than the flight shows, until the bounce tells more
-    sigma: float  # [-] of that
-    mild: float  # share of balls whose spin is uniform in the inner sphere; the others' is in the outer one
-    inner: float  # [rad/s]
-    outer: float  # [rad/s]
+    mild: float  # how likely a stranger's ball is a mild one (``bounce_spin``)
+    renewed: (
+        float  # how likely the other side is another one from a ball to the next; 1: nothing is learnt of it
+    )
 
 
 EXPECTED: Final[Mapping[Expectation, Expected]] = {
-    # factors of mild and strong as measured at the bounce of balls of the presets `paper` and `strong`
-    "mild": Expected(1.2, 0.2, 1.0, 100.0, 100.0),
-    "mixed": Expected(2.0, 0.8, 0.5, 100.0, 300.0),
-    "strong": Expected(3.3, 1.0, 0.0, 300.0, 300.0),
+    "mild": Expected(1.0, 1.0),
+    "mixed": Expected(0.5, 1.0),
+    "strong": Expected(0.0, 1.0),
+    "learnt": Expected(0.5, 0.02),
 }
+# By how much faster a ball spins than its flight shows, mean and sigma [-]: measured at the bounce of balls of the
+# presets `paper` and `strong`
+_MILD_FACTOR, _STRONG_FACTOR = (1.2, 0.2), (3.3, 1.0)
 _LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
 _SATURATION = SIMPLE_LIFT_MAX / (
     SIMPLE_LIFT_SLOPE * BALL_RADIUS
@@ -117,7 +121,8 @@ _SURPRISE = 0.06  # [s] a bounce that was foreseen farther off than this was not
 def new_tracks(count: int, expected: Expectation = "mild") -> Array:
     """Return rows (count, TRACK) for balls that are expected to spin as ``EXPECTED`` says."""
     tracks = np.zeros((count, TRACK))
-    tracks[:, FACTOR:] = EXPECTED[expected]
+    tracks[:, [FIRST_MILD, RENEWED]] = EXPECTED[expected]
+    tracks[:, FOUND_MILD] = tracks[:, FIRST_MILD]
     return tracks
 
 
@@ -134,7 +139,13 @@ def begin_track(
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
     """
-    track[:FACTOR] = 0.0
+    track[:FIRST_MILD] = 0.0
+    first, stays = track[FIRST_MILD], 1.0 - track[RENEWED]
+    mild = first + stays * (track[FOUND_MILD] - first)
+    factor = mild * _MILD_FACTOR[0] + (1.0 - mild) * _STRONG_FACTOR[0]
+    variance = mild * ((_MILD_FACTOR[0] - factor) ** 2 + _MILD_FACTOR[1] ** 2)
+    variance += (1.0 - mild) * ((_STRONG_FACTOR[0] - factor) ** 2 + _STRONG_FACTOR[1] ** 2)
+    track[MILD], track[FACTOR], track[FACTOR_SIGMA] = mild, factor, math.sqrt(variance)
     track[MOMENT], track[BEGUN] = moment, moment
     track[POS : POS + 6] = seen[:6]
     track[NOMINAL_DRAG], track[LEFT] = 1.0, 1.0
@@ -222,7 +233,7 @@ def _estimate(track: Array) -> tuple[Vec, Vec, Vec, float]:
 
 @kernel
 def _tell_spin(track: Array, lower: Array) -> None:
-    """Write the spin behind the bounce, as samples from there tell it (``bounce_spin``).
+    """Write the spin behind the bounce, as samples from there tell it, and how likely the ball is a mild one.
 
     Args:
         track: Written.
@@ -255,14 +266,14 @@ def _tell_spin(track: Array, lower: Array) -> None:
     error_yx = xy / error_xx
     error_yy = math.sqrt(yy + BEFORE_SIGMA * BEFORE_SIGMA - error_yx * error_yx)
     _, _, otherwise, _ = _estimate(track)
-    spin = spin_behind_bounce(
+    spin, track[FOUND_MILD] = spin_behind_bounce(
         before,
         change,
         (error_xx, error_yx, error_yy),
         vec_at(track, PULL),
         track[AGREE:GUESS].reshape(3, 3),
         _SATURATION * norm(before),
-        vec_at(track, USUAL),
+        track[MILD],
         otherwise,
         POINTS,
     )

@@ -43,7 +43,8 @@ def main(stop: Event) -> int:
         set_up_logging(config.log_level, "evaluator")
         folder = Path(config.policy)
         policy = load_policy(folder)
-        env = once.task_of(policy.contract, config.env, config.noise, config.rounds)
+        contract = policy.contract.expecting(config.spin_expected)
+        env = once.task_of(contract, config.env, config.noise, config.rounds)
         found = once.measure(policy, folder, env, config, lambda: once.check(stop))
         once.print_measures(found, config.json_line)
         return DONE

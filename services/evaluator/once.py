@@ -71,6 +71,7 @@ def measure(
         "seed": config.seed,
         "collision": env.collision,
         "perception": env.perception,
+        "spin_expected": env.observation.spin_expected,
         "policy": str(folder),
         "seconds": round(time.monotonic() - started, 2),
     }

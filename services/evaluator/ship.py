@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,7 @@ from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
 from common.policy.weights import load_policy, write_policy
 from common.process import DONE
+from common.rally.observation import Expectation
 from services.evaluator import once
 from services.evaluator.report.origin import commit_of
 
@@ -42,6 +43,11 @@ class ShipConfig(BaseModel):
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
     envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    spin_expected: Expectation | Literal["contract"] = Field(
+        "contract",
+        description="how fast the robot expects balls to spin (env.observation.spin_expected), whatever it was "
+        "trained with; contract: as the policy's says",
+    )
 
 
 class _Exam(BaseModel):
@@ -61,10 +67,11 @@ def main(argv: Sequence[str], stop: Event) -> int:
     set_up_logging("info", "evaluator")
     folder = Path(config.policy)
     policy = load_policy(folder)
+    contract = policy.contract.expecting(config.spin_expected)
     found: dict[str, Any] = {}
     for name, what in EXAMS.items():
         exam = _Exam(rallies=config.rallies, seed=config.seed, envs=config.envs, **what)
-        env = once.task_of(policy.contract, EnvConfig(), exam.noise, exam.rounds)
+        env = once.task_of(contract, EnvConfig(), exam.noise, exam.rounds)
         found[name] = once.measure(policy, folder, env, exam, lambda: once.check(stop))
         for unwanted in ("by", "policy"):
             found[name].pop(unwanted)
@@ -76,7 +83,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
             found[name]["target_error_mean"],
         )
     made_with = policy.contract.made_with | {"commit": commit_of(Path(__file__).parent) or "unknown"}
-    contract = policy.contract.model_copy(update={"measures": found, "made_with": made_with})
+    contract = contract.model_copy(update={"measures": found, "made_with": made_with})
     target = BOX / config.name
     write_policy(target, policy.network, policy.moments, contract)
     sys.stdout.write(json.dumps({"policy": str(target), "measures": found}) + "\n")

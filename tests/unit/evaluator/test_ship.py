@@ -44,6 +44,19 @@ def test_a_shipped_policy_is_measured_on_every_exam_and_plays_as_it_did(box, cap
     assert not list((box / "assets" / "policies").glob(".*"))
 
 
+def test_it_can_be_shipped_with_other_spins_expected_and_is_measured_so(box):
+    trained = put_policy(box / "trained")
+
+    ship.main(
+        ["--policy", "trained", "--name", "mine", "--rallies", "4", "--spin-expected", "learnt"], Event()
+    )
+
+    contract = load_policy(box / "assets" / "policies" / "mine").contract
+    assert contract.observation_options.spin_expected == "learnt"
+    assert {exam["spin_expected"] for exam in contract.measures.values()} == {"learnt"}
+    assert contract.env == trained.contract.env  # what it was trained with stays
+
+
 def test_what_is_no_policy_is_not_shipped(box):
     with pytest.raises(PolicyError, match="no policy in"):
         ship.main(["--policy", "nowhere", "--rallies", "5"], Event())

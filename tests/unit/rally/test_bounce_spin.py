@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 
 from common.physics.table_bounce import table_bounce
-from common.rally.bounce_spin import POINTS, density, quasi_random, shown_likelihood, spin_behind_bounce
+from common.rally.bounce_spin import (
+    INNER,
+    OUTER,
+    POINTS,
+    densities,
+    quasi_random,
+    shown_likelihood,
+    spin_behind_bounce,
+)
 
 UP = (0.0, 0.0, 1.0)
 COMING = (-5.0, 0.8, -2.5)
 SATURATED = 64.0  # rad/s
-MILD, MIXED, STRONG = (1.0, 100.0, 100.0), (0.5, 100.0, 300.0), (0.0, 300.0, 300.0)
+MILD, MIXED, STRONG = 1.0, 0.5, 0.0
 SHOWN_SIGMA = 18.0  # rad/s
 ERROR = 0.05  # m/s
 NOWHERE = (1e6, 1e6, 1e6)
@@ -34,21 +42,30 @@ def told(spin, friction=0.25) -> tuple:
     return tuple(np.subtract(rising, COMING)), tuple(agree @ shows(np.array(spin))), agree
 
 
-def found(spin, usual, points, friction=0.25, error=ERROR) -> np.ndarray:
-    change, pull, agree = told(spin, friction)
-    errors = (error, 0.0, error)
-    return np.array(
-        spin_behind_bounce(COMING, change, errors, pull, agree, SATURATED, usual, NOWHERE, points)
+def concluded(spin, mild, points, error=ERROR) -> tuple[np.ndarray, float]:
+    change, pull, agree = told(spin)
+    spin, is_mild = spin_behind_bounce(
+        COMING, change, (error, 0.0, error), pull, agree, SATURATED, mild, NOWHERE, points
     )
+    return np.array(spin), is_mild
 
 
-def drawn(spin, usual, friction=0.25) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and sigma of the spin behind the bounce among all balls that agree with what was told."""
+def found(spin, mild, points, error=ERROR) -> np.ndarray:
+    return concluded(spin, mild, points, error)[0]
+
+
+def drawn(spin, mild) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return mean and sigma of the spin behind the bounce among all balls that agree with what was told.
+
+    And the share of mild ones among them.
+    """
     rng = np.random.default_rng(0)
-    mild, inner, outer = usual
-    radius = np.where(rng.random((BALLS, 1)) < mild, inner, outer)
-    spins, frictions = in_sphere(BALLS, radius, rng), rng.normal(0.25, 0.029, BALLS)
-    change, pull, agree = told(spin, friction)
+    is_mild = rng.random((BALLS, 1)) < mild
+    spins, frictions = (
+        in_sphere(BALLS, np.where(is_mild, INNER, OUTER), rng),
+        rng.normal(0.25, 0.029, BALLS),
+    )
+    change, pull, agree = told(spin)
     behind = np.array(
         [
             np.concatenate(table_bounce(COMING, tuple(w), UP, 0.975, mu))
@@ -61,7 +78,8 @@ def drawn(spin, usual, friction=0.25) -> tuple[np.ndarray, np.ndarray]:
     weights = np.exp(logs - logs.max())
     mean = np.average(behind[:, 3:], axis=0, weights=weights)
     assert weights.sum() ** 2 / (weights**2).sum() > 150.0  # enough of them agree
-    return mean, np.sqrt(np.average((behind[:, 3:] - mean) ** 2, axis=0, weights=weights))
+    sigma = np.sqrt(np.average((behind[:, 3:] - mean) ** 2, axis=0, weights=weights))
+    return mean, sigma, np.average(is_mild[:, 0], weights=weights)
 
 
 CASES = [
@@ -74,18 +92,28 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("spin", "usual"), CASES)
-def test_it_is_the_mean_of_all_balls_that_agree(spin, usual):
-    mean, sigma = drawn(spin, usual)
+@pytest.mark.parametrize(("spin", "mild"), CASES)
+def test_it_is_the_mean_of_all_balls_that_agree(spin, mild):
+    mean, sigma, share = drawn(spin, mild)
+    said, is_mild = concluded(spin, mild, MANY)
 
-    assert (np.abs(found(spin, usual, MANY) - mean) < 0.2 * sigma + 1.0).all()
+    assert (np.abs(said - mean) < 0.2 * sigma + 1.0).all()
+    assert is_mild == pytest.approx(share, abs=0.06)
 
 
-@pytest.mark.parametrize(("spin", "usual"), CASES)
-def test_few_points_do(spin, usual):
-    mean, sigma = drawn(spin, usual)
+@pytest.mark.parametrize(("spin", "mild"), CASES)
+def test_few_points_do(spin, mild):
+    mean, sigma, share = drawn(spin, mild)
+    said, is_mild = concluded(spin, mild, POINTS)
 
-    assert (np.abs(found(spin, usual, POINTS) - mean) < 0.6 * sigma + 1.0).all()
+    assert (np.abs(said - mean) < 0.6 * sigma + 1.0).all()
+    assert is_mild == pytest.approx(share, abs=0.25)
+
+
+def test_a_ball_of_either_kind_is_known_for_it():
+    """A strong one at once; a mild one only less and less likely a strong one."""
+    assert concluded((10.0, -220.0, 60.0), MIXED, MANY)[1] < 0.02
+    assert concluded((20.0, -40.0, 20.0), MIXED, MANY)[1] > 0.9
 
 
 def test_a_rolling_bounce_tells_the_spin_in_the_tables_plane():
@@ -109,7 +137,7 @@ def test_the_sign_of_the_sidespin_is_the_flights():
     told_so = found((0.0, 100.0, 150.0), STRONG, MANY)
     change, pull, agree = told((0.0, 100.0, 150.0))
     agree[2, 2] = 1e-8
-    hidden = spin_behind_bounce(
+    hidden, _ = spin_behind_bounce(
         COMING,
         change,
         (ERROR, 0.0, ERROR),
@@ -125,12 +153,12 @@ def test_the_sign_of_the_sidespin_is_the_flights():
     assert abs(hidden[2]) < 15.0
 
 
-@pytest.mark.parametrize("usual", [MILD, MIXED, STRONG])
-def test_densities_are_of_the_outer_spheres_balls(usual):
+def test_there_are_as_many_balls_of_either_kind():
     rate = np.linspace(0.5, 399.5, 400)
-    dense = np.array([density(r, *usual) for r in rate])
+    dense = np.array([densities(r) for r in rate])
 
-    assert (4 * np.pi * rate**2 * dense).sum() == pytest.approx(4 / 3 * np.pi * usual[2] ** 3, rel=0.02)
+    shells = 4 * np.pi * rate[:, None] ** 2
+    np.testing.assert_allclose((shells * dense).sum(axis=0), 4 / 3 * np.pi * OUTER**3, rtol=0.02)
 
 
 def test_what_a_flight_says_is_the_estimate_less_its_prior_with_the_lift_factors_spread():
@@ -155,7 +183,7 @@ def test_where_nothing_agrees_it_says_what_it_was_given():
         (0.0, 0.0, 0.0), change, (ERROR, 0.0, ERROR), pull, agree, 0.0, MILD, (1.0, 2.0, 3.0), POINTS
     )
 
-    assert spin == (1.0, 2.0, 3.0)
+    assert spin == ((1.0, 2.0, 3.0), MILD)
 
 
 def test_points_are_spread_evenly():
