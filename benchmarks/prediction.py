@@ -24,7 +24,7 @@ from common.rally.launch_presets import PRESETS
 from common.rally.noise import PROFILES
 from common.rally.observation import Expectation, ObservationConfig
 from common.rally.play import SAMPLE
-from common.rally.prediction import EXPECTED, MEETING, MEETING_AFTER, PRESENT, SPIN
+from common.rally.prediction import MEETING, MEETING_AFTER, PRESENT, SPIN
 from common.rally.trajectory import State
 
 Array = npt.NDArray[np.float64]
@@ -113,9 +113,9 @@ def main() -> None:
     parser.add_argument("--launch", choices=PRESETS, default="paper", help="launch preset (default paper)")
     parser.add_argument(
         "--spin-expected",
-        choices=EXPECTED,
+        choices=("mild", "mixed", "strong"),
         default="mild",
-        help="env.observation.spin_expected (default mild)",
+        help="env.observation.spin_expected of a first ball (default mild)",
     )
     parser.add_argument("--noise", choices=PROFILES, default="standard", help="profile (default standard)")
     parser.add_argument("--seed", type=int, default=0, help="of the balls (default 0)")

@@ -107,7 +107,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode: anew with a seed, or else the one that follows on the last."""
+        """Begin an episode: anew with a seed, or else the one that follows on the last, against the same other side."""
         super().reset(seed=seed)
         if seed is not None or self._table.env is None:
             obs = self._table.begin(_fresh_seed(self.np_random))

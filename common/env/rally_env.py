@@ -192,7 +192,7 @@ class RallyEnv:
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
         self._review = self._make_review()
-        self._told = play.told(config.observation)
+        self._told = play.told_by(config.observation)
         self._rallies, self._step = play.allocate(
             count,
             config.observation.history,

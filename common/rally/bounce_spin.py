@@ -32,7 +32,10 @@ TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-] of the tables of 
 _EDGE = 8.0  # [rad/s] spins thin out over this much about a sphere's edge
 _WIDER = 1.3  # by which sidespin is drawn wider than the flight's error, so that no weight is large
 _SHOWN_SIGMA = 50.0  # [rad/s] that a shown spin is, where the flight doesn't tell
-_UNLIKELY = 1e-9  # density beyond the outer sphere, of the one in it: a spin may be faster than was thought
+_FASTER = (
+    1e-3  # density just beyond the outer sphere, of the one in it: a spin may be faster than was thought
+)
+_UNLIKELY = 1e-9  # that a ball is a strong one where none is expected
 _LEAST_PUSH = 0.1  # [m/s]
 _DISTANT = 6.0  # sigmas: farther off all friction is equally unlikely
 _LIFT_SIGMA = 0.115  # [-] of the lift factor: uniform in 0.8..1.2
@@ -59,7 +62,9 @@ def densities(rate: float) -> tuple[float, float]:
     Either's are uniform in a sphere of spins; the unit is the density in the larger.
     """
     within_inner = min(max(0.5 + 0.5 * (INNER - rate) / _EDGE, 0.0), 1.0)
-    within_outer = min(max(0.5 + 0.5 * (OUTER - rate) / _EDGE, _UNLIKELY), 1.0)
+    within_outer = min(
+        max(0.5 + 0.5 * (OUTER - rate) / _EDGE, _FASTER * (OUTER / max(rate, OUTER)) ** 5), 1.0
+    )
     return within_inner * (OUTER / INNER) ** 3, within_outer
 
 
@@ -117,7 +122,7 @@ def spin_behind_bounce(
         saturated: Spin from which on lift is saturated [rad/s].
         mild: How likely it was one before.
         otherwise: Returned where nothing agrees [rad/s].
-        points: ``quasi_random``'s; ``POINTS`` err by a fifth of what is left uncertain.
+        points: ``quasi_random``'s; ``POINTS`` err by a third of what is left uncertain, which adds a twentieth to it.
     """
     count = points.shape[0]
     weights, milds = np.zeros(2 * count), np.zeros(2 * count)
@@ -143,7 +148,7 @@ def spin_behind_bounce(
                 weight = 0.5 * math.erfc(off * math.sqrt(0.5)) / (ROLLING_ALPHA * ROLLING_ALPHA)
             else:
                 half = BALL_RADIUS * math.sqrt(max(fastest * fastest - beside * beside, 0.0))
-                if nearest + half <= rolling:
+                if half == 0.0 or nearest + half <= rolling:
                     continue
                 # densest about the slowest spin: |c| = nearest + half t |t|
                 low = max((rolling - nearest) / half, -1.0)
@@ -177,7 +182,8 @@ def spin_behind_bounce(
             among_mild, among_strong = densities(rate)
             milds[i] = weight * mild * among_mild
             weights[i] = milds[i] + weight * max(1.0 - mild, _UNLIKELY) * among_strong
-            top = max(top, logs[i])
+            if weights[i] > 0.0:
+                top = max(top, logs[i])
             spins[i, 0] = wx + SPIN_PER_VELOCITY * dy
             spins[i, 1] = wy - SPIN_PER_VELOCITY * dx
             spins[i, 2] = wz

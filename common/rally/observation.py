@@ -37,8 +37,8 @@ OBSERVATION: tuple[Part, ...] = (
 """The paper's observation, in its order (it prints "racket position (7)"; only 3 sums to 37)."""
 
 _FILTERED: Final = {
-    "ball_pos": "where the ball is now, as its flight so far tells",
-    "ball_vel": "its velocity now",
+    "ball_pos": "where the ball is now, as its flight so far tells; once it is hit: as perceived",
+    "ball_vel": "its velocity then",
 }
 """Option ``ball: filtered``: what stands there then."""
 
@@ -60,8 +60,8 @@ SPIN_ESTIMATE: tuple[Part, ...] = (
 """Option ``spin: estimated``: what a robot can find out by itself."""
 
 PREDICTION: tuple[Part, ...] = (
-    Part("present_ball_pos", 3, "m", -4.0, 4.0, _FILTERED["ball_pos"]),
-    Part("present_ball_vel", 3, "m/s", -40.0, 40.0, _FILTERED["ball_vel"]),
+    Part("present_ball_pos", 3, "m", -4.0, 4.0, "where the ball is now, as its flight so far tells"),
+    Part("present_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity now"),
     Part("meeting_in", 1, "s", -2.5, 1.2, "time until 0.12 s behind the bounce, about when it will be met"),
     Part("meeting_ball_pos", 3, "m", -8.0, 4.0, "where the ball will be then"),
     Part("meeting_ball_vel", 3, "m/s", -40.0, 40.0, "its velocity then"),
@@ -136,8 +136,8 @@ class ObservationConfig(BaseModel):
     )
     ball: Literal["sampled", "filtered"] = Field(
         "sampled",
-        description="the ball's position and velocity among the paper's 37: its newest sample, late and noisy, or what "
-        "all samples together say of where it is now",
+        description="the ball's position and velocity among the paper's 37: its newest sample, late and noisy, or, "
+        "until it is hit, what all samples together say of where it is now",
     )
     spin: Literal["hidden", "estimated", "true"] = Field(
         "estimated",
@@ -147,7 +147,8 @@ class ObservationConfig(BaseModel):
     spin_expected: Expectation = Field(
         "mild",
         description="how fast balls are expected to spin, for lift saturates and hides it: to 100 rad/s, half of "
-        "them to 300, all of them to 300, or as the other side's earlier balls did",
+        "them to 300, all of them to 300, or as the other side's earlier balls did (learnt: to play with, where an "
+        "environment's balls come from one side; not on launch preset mixed)",
     )
     prediction: bool = Field(
         True,

@@ -55,11 +55,14 @@ class Observer:
         self._options = options
         self._noise = position_noise, velocity_noise
         self._rally, _ = play.allocate(1, options.history, tracks=new_tracks(1, options.spin_expected))
-        self._told = play.told(options)._replace(is_privileged=False)
+        self._told = play.told_by(options)._replace(is_privileged=False)
         self._is_first = True
 
     def begin(self, target: tuple[float, float]) -> None:
-        """Expect a new ball, which is to land at ``target`` [m]: x in 0..1.37, y in -0.76..0.76."""
+        """Expect a new ball of the same other side, which is to land at ``target`` [m]: x in 0..1.37, y in -0.76..0.76.
+
+        What was learnt of how that side spins is kept (``spin_expected`` learnt); another one wants another Observer.
+        """
         self._rally.condition[0, [Condition.TARGET_X, Condition.TARGET_Y]] = target
         self._is_first = True
 

@@ -1,7 +1,8 @@
 """One control step of many rallies: flight, touches, states, reward and what the camera saw.
 
 Each ball is played by one readable function on its own row; the batch is a loop. Nothing here depends on the
-batch's size or order, so a batch equals its rallies played one by one, bit for bit.
+batch's size or order, so a batch equals its rallies played one by one, bit for bit. One thing goes from a row's rally
+to its next, if it is asked for (``spin_expected`` learnt): what was learnt of how the other side spins.
 """
 
 from typing import Final, NamedTuple
@@ -68,7 +69,7 @@ _SPINS = ("hidden", "estimated", "true")
 _SPIN_HIDDEN, _SPIN_TRUE = _SPINS.index("hidden"), _SPINS.index("true")
 
 
-def told(options: ObservationConfig) -> Told:
+def told_by(options: ObservationConfig) -> Told:
     """Return what policy and critic are told."""
     return Told(
         is_filtered=options.ball == "filtered",
@@ -174,7 +175,7 @@ def allocate(
         count: B.
         history: How many earlier samples are remembered.
         full: Whether the ball is perceived by camera and estimator; else by its true state, late and noisy.
-        tracks: ``prediction.new_tracks``, where flights are followed: spin estimated, the meeting predicted.
+        tracks: ``prediction.new_tracks``, where flights are followed: ball filtered, spin estimated, meeting predicted.
         reviewed: Whether contacts are kept, for ``hindsight``.
         path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
     """

@@ -63,15 +63,15 @@ MEETING = PRESENT + 6  # in how long [s], position [m] and velocity [m/s] then (
 SPIN = MEETING + 7  # spin behind the bounce [rad/s] (3)
 # What the flight before the bounce showed, for ``bounce_spin``
 FORESEEN = SPIN + 3  # 1: the bounce came as foreseen, so that it tells of the spin
-BEFORE = FORESEEN + 1  # velocity before it [m/s] (3)
-PULL, AGREE = BEFORE + 3, BEFORE + 6  # ``shown_likelihood`` (3), (3, 3)
+BEFORE, BEFORE_SIGMA = FORESEEN + 1, FORESEEN + 4  # velocity before it (3), and its sigma a axis [m/s]
+PULL, AGREE = BEFORE + 4, BEFORE + 7  # ``shown_likelihood`` (3), (3, 3)
 GUESS = AGREE + 9  # guess at the velocity behind it, with which the fit begins anew [m/s] (3)
 GUESS_INFORMATION = GUESS + 3  # its inverse covariance along the table, xx, xy, yy [s^2/m^2]
 MILD = GUESS_INFORMATION + 3  # how likely the ball was a mild one before it was launched
 FACTOR, FACTOR_SIGMA = MILD + 1, MILD + 2  # so by how much faster it spins than its flight shows
 # ... and what a row keeps from ball to ball
 FIRST_MILD, RENEWED = MILD + 3, MILD + 4  # ``Expected``
-FOUND_MILD = MILD + 5  # how likely the last ball was a mild one
+FOUND_MILD = MILD + 5  # how likely the last ball whose bounce was foreseen was a mild one
 TRACK = MILD + 6  # numbers in a row
 PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and meeting
 
@@ -85,7 +85,7 @@ LEAST_VELOCITY_NOISE = 0.02  # [m/s]
 TABLE_RESTITUTION0_MEAN, TABLE_RESTITUTION0_SIGMA = 0.975, 0.0144  # [-] of the tables of profile `standard`
 BOUNCE_PLACE_SIGMA = 0.006  # [m] a axis: where the bounce was, as foreseen
 BOUNCE_SPEED_SIGMA = 0.05  # [m/s] a axis: with what velocity
-BEFORE_SIGMA = 0.03  # [m/s] a axis: with what velocity the ball came to it
+FLIGHT_SHARE = 0.375  # [-] of a sample's velocity noise is left after a flight's many
 BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
 
 
@@ -93,9 +93,8 @@ class Expected(NamedTuple):
     """What spins are expected, for a flight hides how fast a ball spins once its lift is saturated."""
 
     mild: float  # how likely a stranger's ball is a mild one (``bounce_spin``)
-    renewed: (
-        float  # how likely the other side is another one from a ball to the next; 1: nothing is learnt of it
-    )
+    # how likely the other side is another one from a ball to the next; 1: nothing is learnt of it
+    renewed: float
 
 
 EXPECTED: Final[Mapping[Expectation, Expected]] = {
@@ -262,9 +261,10 @@ def _tell_spin(track: Array, lower: Array) -> None:
         guess[1] + xy * pull_x + yy * pull_y - before[1],
         guess[2] + track[FOUND + _DV + 2] - before[2],
     )
-    error_xx = math.sqrt(xx + BEFORE_SIGMA * BEFORE_SIGMA)
+    known = track[BEFORE_SIGMA] * track[BEFORE_SIGMA]
+    error_xx = math.sqrt(xx + known)
     error_yx = xy / error_xx
-    error_yy = math.sqrt(yy + BEFORE_SIGMA * BEFORE_SIGMA - error_yx * error_yx)
+    error_yy = math.sqrt(yy + known - error_yx * error_yx)
     _, _, otherwise, _ = _estimate(track)
     spin, track[FOUND_MILD] = spin_behind_bounce(
         before,
@@ -425,6 +425,40 @@ def _begin_anew(
 
 
 @kernel
+def _bounce(track: Array, seen: Array, moment: float, velocity_noise: float) -> None:
+    """Take what is known through the bounce, behind which ``seen`` was seen."""
+    pos, vel, spin, drag = _estimate(track)
+    wait, there, then = _to_table(pos, vel, spin, drag)
+    at = track[MOMENT] + wait
+    lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
+    factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
+    inverse(lower, variance)
+    surprises = abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0
+    if surprises:
+        then = (seen[3], seen[4], -abs(seen[5]))
+    covariance = np.empty((6, 6))
+    rising, turned = _through_bounce(then, spin, track[FACTOR], track[FACTOR_SIGMA], variance, covariance)
+    if surprises:  # where and how fast the ball is is what the sample says, and nothing tells of its spin
+        at, there, rising = moment, vec_at(seen, 0), vec_at(seen, 3)
+        covariance[:3] = 0.0
+        covariance[:, :3] = 0.0
+        for k in range(3):
+            covariance[k, k] = max(velocity_noise, LEAST_VELOCITY_NOISE) ** 2
+    else:
+        showing = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN:_DRAG, _SPIN:_DRAG]
+        shown_likelihood(spin, showing, SPIN_SIGMA, track[PULL:AGREE], track[AGREE:GUESS].reshape(3, 3))
+        track[BEFORE_SIGMA] = FLIGHT_SHARE * max(velocity_noise, LEAST_VELOCITY_NOISE)
+        det = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
+        track[GUESS_INFORMATION] = covariance[1, 1] / det
+        track[GUESS_INFORMATION + 1] = -covariance[0, 1] / det
+        track[GUESS_INFORMATION + 2] = covariance[0, 0] / det
+        for k in range(3):
+            track[BEFORE + k], track[GUESS + k] = then[k], rising[k]
+    track[FORESEEN] = 0.0 if surprises else 1.0
+    _begin_anew(track, at, there, rising, turned, covariance, drag, variance[_DRAG, _DRAG])
+
+
+@kernel
 def follow(
     track: Array, seen: Array, moment: float, bounced: bool, position_noise: float, velocity_noise: float
 ) -> None:
@@ -441,35 +475,7 @@ def follow(
     if moment <= track[MOMENT]:
         return
     if bounced and track[BOUNCED] == 0.0:
-        pos, vel, spin, drag = _estimate(track)
-        wait, there, then = _to_table(pos, vel, spin, drag)
-        at = track[MOMENT] + wait
-        lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
-        factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
-        inverse(lower, variance)
-        surprises = abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0
-        if surprises:
-            then = (seen[3], seen[4], -abs(seen[5]))
-        showing = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN:_DRAG, _SPIN:_DRAG]
-        shown_likelihood(spin, showing, SPIN_SIGMA, track[PULL:AGREE], track[AGREE:GUESS].reshape(3, 3))
-        covariance = np.empty((6, 6))
-        vel, spin = _through_bounce(then, spin, track[FACTOR], track[FACTOR_SIGMA], variance, covariance)
-        if surprises:  # where and how fast the ball is is what the sample says
-            at, there, vel = moment, vec_at(seen, 0), vec_at(seen, 3)
-            covariance[:3] = 0.0
-            covariance[:, :3] = 0.0
-            for k in range(3):
-                covariance[k, k] = max(velocity_noise, LEAST_VELOCITY_NOISE) ** 2
-        det = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-        track[GUESS_INFORMATION], track[GUESS_INFORMATION + 2] = (
-            covariance[1, 1] / det,
-            covariance[0, 0] / det,
-        )
-        track[GUESS_INFORMATION + 1] = -covariance[0, 1] / det
-        for k in range(3):
-            track[BEFORE + k], track[GUESS + k] = then[k], vel[k]
-        track[FORESEEN] = 0.0 if surprises else 1.0
-        _begin_anew(track, at, there, vel, spin, covariance, drag, variance[_DRAG, _DRAG])
+        _bounce(track, seen, moment, velocity_noise)
     _take(track, seen, moment, position_noise, velocity_noise)
 
 

@@ -24,7 +24,12 @@ class EvaluatorConfig(ServiceConfig):
     launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
-    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    envs: int = Field(
+        250,
+        ge=1,
+        le=65536,
+        description="environments played together; each meets rallies / envs balls of the same other side",
+    )
     spin_expected: Expectation | Literal["contract"] = Field(
         "contract",
         description="how fast the robot expects balls to spin (env.observation.spin_expected), whatever it was "

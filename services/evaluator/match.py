@@ -57,6 +57,15 @@ def evaluation_rallies(count: int, launch: str, noise: str, seed: int, flight: s
     return draw_rallies(count, seed=seed, preset=launch, noise=noise, purpose=Purpose.EVALUATION, model=model)
 
 
+def environments(rallies: int, most: int, rounds: int) -> int:
+    """Return how many environments share a match's rallies: no more than there are balls for.
+
+    Where episodes go on, each needs room for many, or the set would be dealt as first balls alone.
+    """
+    room = rallies // (EPISODES_EACH * rounds) if rounds > 1 else rallies
+    return min(most, max(1, room))
+
+
 def play_match(
     policy: Policy,
     rallies: RallyBlock,
@@ -75,9 +84,7 @@ def play_match(
 
     A rally in which the simulation failed is left out: there are fewer rows then.
     """
-    # Where episodes go on, each environment needs room for many, or the set would be dealt as first balls alone.
-    room = len(rallies.seeds) // (EPISODES_EACH * config.rounds) if config.rounds > 1 else len(rallies.seeds)
-    envs = min(envs, max(1, room))
+    envs = environments(len(rallies.seeds), envs, config.rounds)
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
     # What only training asks for has no place in a match: every flight is played to its end, and nobody is taught.
     task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0, "hindsight": False})

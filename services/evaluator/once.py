@@ -12,7 +12,7 @@ from common.env.rally_env import EnvConfig
 from common.errors import ReportedError
 from common.policy.weights import Contract, Policy
 from services.evaluator.breakdown import breakdown, survival, table
-from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.match import environments, evaluation_rallies, play_match
 from services.evaluator.measures import measures
 
 
@@ -68,6 +68,7 @@ def measure(
         "launch": config.launch,
         "noise": config.noise,
         "rounds": config.rounds,
+        "envs": environments(config.rallies, config.envs, config.rounds),
         "seed": config.seed,
         "collision": env.collision,
         "perception": env.perception,

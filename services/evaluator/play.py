@@ -38,7 +38,12 @@ class PlayConfig(FilmConfig):
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
-    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    envs: int = Field(
+        250,
+        ge=1,
+        le=65536,
+        description="environments played together; each meets rallies / envs balls of the same other side",
+    )
     json_line: bool = Field(
         False, alias="json", description="print the measures as one JSON object, last line"
     )

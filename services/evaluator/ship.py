@@ -42,7 +42,12 @@ class ShipConfig(BaseModel):
     name: str = Field("default", pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
-    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    envs: int = Field(
+        250,
+        ge=1,
+        le=65536,
+        description="environments played together; each meets rallies / envs balls of the same other side",
+    )
     spin_expected: Expectation | Literal["contract"] = Field(
         "contract",
         description="how fast the robot expects balls to spin (env.observation.spin_expected), whatever it was "

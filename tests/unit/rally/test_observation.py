@@ -42,7 +42,7 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, record=
         np.array([0]),
         np.array([joints]),
         np.array([rates]),
-        told=play.told(PAPER_OBSERVATION),
+        told=play.told_by(PAPER_OBSERVATION),
         out=out,
     )
     return out[0]

@@ -1,5 +1,7 @@
 """What a flight tells: the fit is a slow least squares, the bounce a Monte Carlo's, and rallies bear both out."""
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,12 @@ from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.table_bounce import table_bounce
 from common.rally import prediction
 from common.rally.launch import draw_rallies
+from common.rally.observation import Expectation
 from common.rally.prediction import (
     BOUNCED,
+    EXPECTED,
+    FACTOR_SIGMA,
+    FORESEEN,
     FOUND,
     MEETING,
     MEETING_AFTER,
@@ -203,14 +209,17 @@ def test_the_prior_behind_the_bounce_is_a_monte_carlos(spin):
     np.testing.assert_allclose(covariance / np.outer(sigma, sigma), np.corrcoef(after.T), atol=0.15)
 
 
-def bounced(spin, vel=FLYING):
+def bounced(spin, vel=FLYING, factor_sigma=None, noise=(0.0, 0.0)):
     """Return the track 0.09 s behind the bounce, and the ball's spin there."""
+    rng = np.random.default_rng(3)
     moment, place, falling = bounce_of(spin, vel)
     rising, turned = table_bounce(falling, spin, UP, 0.975, 0.25)
     moments = np.arange(0.0, moment, 0.02)
-    track = tracked(samples(spin, moments, vel=vel), moments)
+    track = tracked(samples(spin, moments, vel=vel, noise=noise), moments, noise)
+    track[FACTOR_SIGMA] = track[FACTOR_SIGMA] if factor_sigma is None else factor_sigma
     for later in np.arange(0.01, 0.1, 0.02):
-        follow(track, np.concatenate(flown(turned, later, place, rising)), moment + later, True, 0.0, 0.0)
+        seen = np.concatenate(flown(turned, later, place, rising)) + rng.normal(size=6) * np.repeat(noise, 3)
+        follow(track, seen, moment + later, True, *noise)
     return track, turned
 
 
@@ -310,13 +319,13 @@ def test_a_single_wild_sample_leads_to_no_wild_prediction(height, vertical):
     predict(track, 0.045)
 
     assert np.isfinite(track).all()
-    assert np.abs(track[PRESENT:]).max() < 1500.0
+    assert np.abs(track[PRESENT:FORESEEN]).max() < 1500.0
     follow(track, np.array([0.5, 0.3, 0.1, -5.0, 0.0, 2.0]), 0.06, True, *NOISE)
     predict(track, 0.08)
 
     assert np.isfinite(track).all()
     assert 0.5 <= track[NOMINAL_DRAG] <= 1.5
-    assert np.abs(track[PRESENT:]).max() < 1500.0
+    assert np.abs(track[PRESENT:FORESEEN]).max() < 1500.0
 
 
 def make_env(count, noise="standard", preset="paper", first=0, deck=300, **observation) -> RallyEnv:
@@ -387,6 +396,19 @@ def test_the_other_side_becomes_known_from_ball_to_ball(preset, own):
     assert fourth > 0.9 if own == "mild" else fourth < 0.15
     env.reset()
     np.testing.assert_array_equal(env.rallies.track[:, prediction.MILD], 0.5)
+
+
+def test_every_expectation_is_in_the_table():
+    assert set(EXPECTED) == set(get_args(Expectation))
+    assert all(0.0 <= mild <= 1.0 and 0.0 < renewed <= 1.0 for mild, renewed in EXPECTED.values())
+
+
+def test_the_guess_a_fit_begins_with_behind_the_bounce_isnt_taken_for_evidence():
+    """However tight it is: with what it says taken out of the fit, what the bounce did is the samples' to say."""
+    tight, wide = (bounced((60.0, -45.0, 20.0), factor_sigma=sigma, noise=NOISE)[0] for sigma in (0.05, 3.0))
+
+    assert np.abs(tight[FOUND + 3 : FOUND + 5] - wide[FOUND + 3 : FOUND + 5]).max() > 0.02  # the fits differ
+    np.testing.assert_allclose(tight[SPINNING], wide[SPINNING], atol=2.0)
 
 
 def test_who_learns_nothing_expects_the_same_of_every_ball():
