@@ -4,12 +4,13 @@ A policy folder holds ``weights.safetensors`` (network and observation moments) 
 and comes out, by name and unit, and how the policy came about). Nothing is pickled.
 """
 
+import copy
 import hashlib
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version as package_version
 from pathlib import Path
@@ -43,6 +44,13 @@ WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _ACTING = ("trunk.", "mean.", "log_sigma")  # the policy's parameters; the others are the critic's
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
 _MOMENTS = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)
+_SHAPE = {
+    "observation",
+    "action",
+    "network",
+    "control_rate_hz",
+    "robot",
+}  # of a contract, for weights that may be mixed
 
 
 class PolicyError(ReportedError, ValueError):
@@ -272,6 +280,40 @@ def load_policy(folder: Path) -> Policy:
         if not name.startswith(_ACTING)
     }
     load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    return Policy(network, moments, contract)
+
+
+def mean_policy(policies: Sequence[Policy]) -> Policy:
+    """Return the policy with the mean of several ones' weights and observation moments: a model soup.
+
+    Of policies that set out from one, along different ways, the mean is often better than each (Wortsman et al. 2022).
+    It has the first one's contract, with the most frames of all; ``made_with`` says what it is the mean of.
+
+    Raises:
+        PolicyError: They differ in what they see or in their network.
+    """
+    first = policies[0].contract
+    for policy in policies[1:]:
+        theirs, ours = (c.model_dump(include=_SHAPE) for c in (policy.contract, first))
+        for name, wanted in ours.items():
+            if theirs[name] != wanted:
+                raise PolicyError(f"no mean of policies that differ in {name}: {wanted} and {theirs[name]}")
+    share = 1.0 / len(policies)
+    states = [policy.network.state_dict() for policy in policies]
+    network = copy.deepcopy(policies[0].network)
+    network.load_state_dict({name: sum(state[name] for state in states) * share for name in states[0]})
+    moments = Moments(
+        sum((policy.moments.mean for policy in policies), np.zeros(())) * share,
+        sum((policy.moments.var for policy in policies), np.zeros(())) * share,
+        policies[0].moments.count,
+    )
+    parts = [f"{p.contract.run} {p.contract.frames} frames, launch {p.contract.launch}" for p in policies]
+    contract = first.model_copy(
+        update={
+            "frames": max(policy.contract.frames for policy in policies),
+            "made_with": first.made_with | {"mean_of": "; ".join(parts)},
+        }
+    )
     return Policy(network, moments, contract)
 
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from common.config import load
 from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
-from common.policy.weights import load_policy, write_policy
+from common.policy.weights import load_policy, mean_policy, write_policy
 from common.process import DONE
 from common.rally.observation import Expectation
 from services.evaluator import once
@@ -38,7 +38,11 @@ class ShipConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    policy: str = Field("runs/latest/policy/best", description="policy folder")
+    policy: str = Field(
+        "runs/latest/policy/best",
+        description="policy folder; several, separated by commas: the mean of their weights, for policies that set out "
+        "from one",
+    )
     name: str = Field("default", pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
@@ -70,14 +74,14 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and write; return the exit status."""
     config = load(ShipConfig, argv, prog=PROG, section="ship")
     set_up_logging("info", "evaluator")
-    folder = Path(config.policy)
-    policy = load_policy(folder)
+    policies = [load_policy(Path(folder)) for folder in config.policy.split(",")]
+    policy = mean_policy(policies) if len(policies) > 1 else policies[0]
     contract = policy.contract.expecting(config.spin_expected)
     found: dict[str, Any] = {}
     for name, what in EXAMS.items():
         exam = _Exam(rallies=config.rallies, seed=config.seed, envs=config.envs, **what)
         env = once.task_of(contract, EnvConfig(), exam.noise, exam.rounds)
-        found[name] = once.measure(policy, folder, env, exam, lambda: once.check(stop))
+        found[name] = once.measure(policy, Path(config.policy), env, exam, lambda: once.check(stop))
         for unwanted in ("by", "policy"):
             found[name].pop(unwanted)
         log.info(

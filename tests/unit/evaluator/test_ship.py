@@ -57,6 +57,19 @@ def test_it_can_be_shipped_with_other_spins_expected_and_is_measured_so(box):
     assert contract.env == trained.contract.env  # what it was trained with stays
 
 
+def test_of_several_policies_the_mean_is_shipped(box):
+    one, other = put_policy(box / "one"), put_policy(box / "other")
+
+    ship.main(["--policy", "one,other", "--name", "mine", "--rallies", "4"], Event())
+
+    shipped = load_policy(box / "assets" / "policies" / "mine")
+    parts = [policy.network.state_dict()["mean.weight"].numpy() for policy in (one, other)]
+    np.testing.assert_allclose(
+        shipped.network.state_dict()["mean.weight"].numpy(), np.mean(parts, axis=0), atol=1e-7
+    )
+    assert shipped.contract.made_with["mean_of"].count("frames") == 2
+
+
 def test_what_is_no_policy_is_not_shipped(box):
     with pytest.raises(PolicyError, match="no policy in"):
         ship.main(["--policy", "nowhere", "--rallies", "5"], Event())

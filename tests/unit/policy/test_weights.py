@@ -15,6 +15,7 @@ from common.policy.weights import (
     Policy,
     PolicyError,
     load_policy,
+    mean_policy,
     new_network,
     observation_contract,
     pack,
@@ -90,6 +91,36 @@ def test_a_newer_policy_replaces_the_older_which_stays_once_more_for_its_readers
 
     assert len([path for path in tmp_path.iterdir() if not path.is_symlink()]) == 2
     assert load_policy(tmp_path / "latest").contract.version == 2
+
+
+def test_the_mean_of_policies_has_the_mean_of_their_weights_and_says_so():
+    def policy(seed, **changes):
+        torch.manual_seed(seed)
+        moments = Moments(np.full(37, float(seed)), np.full(37, 1.0 + seed), 9)
+        return Policy(new_network(SMALL), moments, make_contract(**changes))
+
+    one, other = policy(1, frames=10), policy(3, frames=30, launch="strong")
+    before = {name: value.clone() for name, value in one.network.state_dict().items()}
+    mean = mean_policy([one, other])
+
+    for name, value in mean.network.state_dict().items():
+        wanted = 0.5 * (before[name] + other.network.state_dict()[name])
+        torch.testing.assert_close(value, wanted)
+        assert torch.equal(one.network.state_dict()[name], before[name])
+    np.testing.assert_allclose(mean.moments.mean, 2.0)
+    np.testing.assert_allclose(mean.moments.var, 3.0)
+    assert mean.contract.frames == 30
+    assert mean.contract.made_with["mean_of"] == "r 10 frames, launch paper; r 30 frames, launch strong"
+    obs = np.random.default_rng(0).normal(size=(4, 37)).astype(np.float32)
+    np.testing.assert_allclose(mean_policy([one, one]).act(obs), one.act(obs), atol=1e-6)
+
+
+def test_policies_of_different_shape_have_no_mean():
+    one = Policy(new_network(SMALL), Moments.initial(37), make_contract())
+    other = Policy(new_network(SMALL), Moments.initial(37), make_contract(control_rate_hz=200.0))
+
+    with pytest.raises(PolicyError, match=r"differ in control_rate_hz: 50.0 and 200.0"):
+        mean_policy([one, other])
 
 
 def test_weights_travel_as_bytes_and_arrive_unchanged():
