@@ -101,7 +101,7 @@ EXPECTED: Final[Mapping[Expectation, Expected]] = {
     "mild": Expected(1.0, 1.0),
     "mixed": Expected(0.5, 1.0),
     "strong": Expected(0.0, 1.0),
-    "learnt": Expected(0.5, 0.02),
+    "learnt": Expected(0.8, 0.01),
 }
 # By how much faster a ball spins than its flight shows, mean and sigma [-]: measured at the bounce of balls of the
 # presets `paper` and `strong`
