@@ -26,7 +26,7 @@ class Dealer:
     """Deals a generator's rallies, every third of them as if nobody had validated it."""
 
     def __init__(self):
-        self.block = draw_rallies(400, seed=5)
+        self.block = draw_rallies(1600, seed=5)
         self.dealt = 0
 
     def take(self, count):
@@ -196,8 +196,8 @@ def test_a_step_without_hits_leaves_the_corrections():
 
 
 def struck_block(monkeypatch, stage=3, **changes):
-    """Return a block of 128 robots that stand about home, some of which the ball hits, and its steps' lessons."""
-    player = Player(CONFIG.model_copy(update=changes), NETWORK, Dealer(), 128, HORIZON, 1)
+    """Return a block of 512 robots that stand about home, some of which the ball hits, and its steps' lessons."""
+    player = Player(CONFIG.model_copy(update=changes), NETWORK, Dealer(), 512, HORIZON, 1)
     torch.manual_seed(0)
     network = new_network(NETWORK, OBSERVATION, player.env.home_action)
     with torch.no_grad():
