@@ -85,6 +85,7 @@ LEAST_VELOCITY_NOISE = 0.02  # [m/s]
 TABLE_RESTITUTION0_MEAN, TABLE_RESTITUTION0_SIGMA = 0.975, 0.0144  # [-] of the tables of profile `standard`
 BOUNCE_PLACE_SIGMA = 0.006  # [m] a axis: where the bounce was, as foreseen
 BOUNCE_SPEED_SIGMA = 0.05  # [m/s] a axis: with what velocity
+TELLING = 0.15  # [s] behind the bounce later samples tell no more of it, and cost as much
 FLIGHT_SHARE = 0.375  # [-] of a sample's velocity noise is left after a flight's many
 BOUNCE_SPIN_SIGMA = 1.0  # [rad/s] a axis: what the law leaves open
 
@@ -306,7 +307,7 @@ def _take(track: Array, seen: Array, moment: float, position_noise: float, veloc
     lower = np.empty((UNKNOWNS, UNKNOWNS))
     factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
     substitute(lower, track[RIGHT:PRESENT], track[FOUND:NORMAL])
-    if track[FORESEEN] == 1.0:
+    if track[FORESEEN] == 1.0 and track[MOMENT] - track[BEGUN] < TELLING:
         _tell_spin(track, lower)
 
 
