@@ -197,9 +197,7 @@ class RallyEnv:
             count,
             config.observation.history,
             full=config.perception == "full",
-            tracks=new_tracks(count, config.observation.spin_expected)
-            if config.observation.is_tracked
-            else play.NO_TRACKS,
+            tracks=self._new_tracks(),
             reviewed=self._review is not None,
             path_rows=path_rows,
         )
@@ -248,8 +246,7 @@ class RallyEnv:
     def reset(self) -> Floats:
         """Start every environment anew, robots at home, against strangers; return the first observations (B, D)."""
         self._started = False
-        if self.config.observation.is_tracked:  # nothing is known of the other side
-            self._rallies.track[:] = new_tracks(self.count, self.config.observation.spin_expected)
+        self._rallies.track[:] = self._new_tracks()  # nothing is known of the other side
         self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
         self._rallies.last_action[:] = self.robot.home_action
         self._begin(self._all, np.zeros(self.count, np.bool_))
@@ -308,6 +305,11 @@ class RallyEnv:
         if self.config.collision == "original":
             return OriginalCollision(RobotAndBall(self.count, preset, rate, self._flight_model, threads))
         return TailoredCollision(RobotBatch(self.count, preset, rate, threads=threads))
+
+    def _new_tracks(self) -> Array:
+        """Return a row for each ball, or none where nobody asks what its samples tell."""
+        options = self.config.observation
+        return new_tracks(self.count if options.is_tracked else 0, options.spin_expected)
 
     def _make_review(self) -> Review | None:
         """Return who corrects hits, if anybody does."""

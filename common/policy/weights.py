@@ -44,13 +44,8 @@ WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _ACTING = ("trunk.", "mean.", "log_sigma")  # the policy's parameters; the others are the critic's
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
 _MOMENTS = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)
-_SHAPE = {
-    "observation",
-    "action",
-    "network",
-    "control_rate_hz",
-    "robot",
-}  # of a contract, for weights that may be mixed
+# What contracts must agree in for a mean of their policies' weights
+_SHAPE = {"observation", "action", "network", "control_rate_hz", "robot"}
 
 
 class PolicyError(ReportedError, ValueError):

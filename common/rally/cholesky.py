@@ -11,6 +11,13 @@ Array = npt.NDArray[np.float64]
 
 
 @kernel
+def inverse_2(xx: float, xy: float, yy: float) -> tuple[float, float, float]:
+    """Return xx, xy and yy of a symmetric 2 x 2 matrix's inverse."""
+    det = xx * yy - xy * xy
+    return yy / det, -xy / det, xx / det
+
+
+@kernel
 def factor(matrix: Array, lower: Array) -> None:
     """Write L with L L' = ``matrix`` (n, n), of which the lower triangle is read; nan where it isn't positive."""
     for i in range(matrix.shape[0]):

@@ -38,7 +38,7 @@ from common.rally.bounce_spin import (
     shown_likelihood,
     spin_behind_bounce,
 )
-from common.rally.cholesky import factor, inverse, substitute
+from common.rally.cholesky import factor, inverse, inverse_2, substitute
 from common.rally.observation import Expectation
 
 Array = npt.NDArray[np.float64]
@@ -247,15 +247,14 @@ def _tell_spin(track: Array, lower: Array) -> None:
     substitute(lower, unit, column)
     yy = column[_DV + 1]
     # The samples alone: the fit's information on the velocity along the table, less that of the guess it began with
-    det = xx * yy - xy * xy
+    info_xx, info_xy, info_yy = inverse_2(xx, xy, yy)
     dx, dy = track[FOUND + _DV], track[FOUND + _DV + 1]
-    pull_x, pull_y = (yy * dx - xy * dy) / det, (xx * dy - xy * dx) / det
-    info_xx = max(yy / det - track[GUESS_INFORMATION], _LEAST_INFORMATION)
-    info_yy = max(xx / det - track[GUESS_INFORMATION + 2], _LEAST_INFORMATION)
+    pull_x, pull_y = info_xx * dx + info_xy * dy, info_xy * dx + info_yy * dy
+    info_xx = max(info_xx - track[GUESS_INFORMATION], _LEAST_INFORMATION)
+    info_yy = max(info_yy - track[GUESS_INFORMATION + 2], _LEAST_INFORMATION)
     most = 0.9 * math.sqrt(info_xx * info_yy)
-    info_xy = min(max(-xy / det - track[GUESS_INFORMATION + 1], -most), most)
-    det = info_xx * info_yy - info_xy * info_xy
-    xx, xy, yy = info_yy / det, -info_xy / det, info_xx / det
+    info_xy = min(max(info_xy - track[GUESS_INFORMATION + 1], -most), most)
+    xx, xy, yy = inverse_2(info_xx, info_xy, info_yy)
     before, guess = vec_at(track, BEFORE), vec_at(track, GUESS)
     change = (
         guess[0] + xx * pull_x + xy * pull_y - before[0],
@@ -449,11 +448,9 @@ def _bounce(track: Array, seen: Array, moment: float, velocity_noise: float) -> 
         showing = SPIN_SIGMA * SPIN_SIGMA * variance[_SPIN:_DRAG, _SPIN:_DRAG]
         shown_likelihood(spin, showing, SPIN_SIGMA, track[PULL:AGREE], track[AGREE:GUESS].reshape(3, 3))
         track[BEFORE_SIGMA] = FLIGHT_SHARE * max(velocity_noise, LEAST_VELOCITY_NOISE)
-        det = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-        track[GUESS_INFORMATION] = covariance[1, 1] / det
-        track[GUESS_INFORMATION + 1] = -covariance[0, 1] / det
-        track[GUESS_INFORMATION + 2] = covariance[0, 0] / det
+        information = inverse_2(covariance[0, 0], covariance[1, 0], covariance[1, 1])
         for k in range(3):
+            track[GUESS_INFORMATION + k] = information[k]
             track[BEFORE + k], track[GUESS + k] = then[k], rising[k]
     track[FORESEEN] = 0.0 if surprises else 1.0
     _begin_anew(track, at, there, rising, turned, covariance, drag, variance[_DRAG, _DRAG])

@@ -7,8 +7,8 @@ from pydantic import Field
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
 from common.rally.launch_presets import PresetName
-from common.rally.observation import Expectation
 from common.service_config import ServiceConfig
+from services.evaluator.match import DEFAULT_ENVS, Environments, PolicyExpectation
 
 
 class EvaluatorConfig(ServiceConfig):
@@ -24,17 +24,8 @@ class EvaluatorConfig(ServiceConfig):
     launch: PresetName = Field("paper", description="launch preset")
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
-    envs: int = Field(
-        250,
-        ge=1,
-        le=65536,
-        description="environments played together; each meets rallies / envs balls of the same other side",
-    )
-    spin_expected: Expectation | Literal["contract"] = Field(
-        "contract",
-        description="how fast the robot expects balls to spin (env.observation.spin_expected), whatever it was "
-        "trained with, with --policy; contract: as the policy's says",
-    )
+    envs: Environments = DEFAULT_ENVS
+    spin_expected: PolicyExpectation = "contract"
     json_line: bool = Field(
         False, alias="json", description="print the measures as one JSON object, last line"
     )

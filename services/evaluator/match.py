@@ -1,22 +1,41 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from common.env.rally_env import EnvConfig, FinishedRallies, Launches, RallyEnv
 from common.physics.flight import FULL, SIMPLE
 from common.policy.weights import Policy
 from common.rally.launch import Purpose, RallyBlock, draw_rallies
 from common.rally.noise import Condition
+from common.rally.observation import Expectation
 from common.rally.play import NO_SAMPLE
 from common.rally.undisturbed import undisturbed
 from services.evaluator.measures import Played
 
 DEFAULT_ENVS = 250
 EPISODES_EACH = 4  # whole ones that an environment has rallies for
+
+# Settings of every command that plays a match
+Environments = Annotated[
+    int,
+    Field(
+        ge=1,
+        le=65536,
+        description="environments played together; each meets rallies / envs balls of the same other side",
+    ),
+]
+PolicyExpectation = Annotated[
+    Expectation | Literal["contract"],
+    Field(
+        description="how fast the robot of --policy expects balls to spin (env.observation.spin_expected), whatever it "
+        "was trained with; contract: as the policy's says"
+    ),
+]
 
 
 class FixedRallies:

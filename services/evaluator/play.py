@@ -19,7 +19,7 @@ from common.render.rally_recorder import record
 from common.run_folder import LATEST, RunFolder
 from services.evaluator import once
 from services.evaluator.filming import FilmConfig, film
-from services.evaluator.match import evaluation_rallies
+from services.evaluator.match import DEFAULT_ENVS, Environments, evaluation_rallies
 
 PROG: Final = "python -m services.evaluator play"
 SHIPPED_POLICY: Final = Path("assets/policies/default")
@@ -38,12 +38,7 @@ class PlayConfig(FilmConfig):
     noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
-    envs: int = Field(
-        250,
-        ge=1,
-        le=65536,
-        description="environments played together; each meets rallies / envs balls of the same other side",
-    )
+    envs: Environments = DEFAULT_ENVS
     json_line: bool = Field(
         False, alias="json", description="print the measures as one JSON object, last line"
     )

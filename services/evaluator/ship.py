@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,8 +15,8 @@ from common.env.rally_env import EnvConfig
 from common.log import set_up_logging
 from common.policy.weights import load_policy, mean_policy, write_policy
 from common.process import DONE
-from common.rally.observation import Expectation
 from services.evaluator import once
+from services.evaluator.match import DEFAULT_ENVS, Environments, PolicyExpectation
 from services.evaluator.report.origin import commit_of
 
 log = logging.getLogger(__name__)
@@ -46,17 +46,8 @@ class ShipConfig(BaseModel):
     name: str = Field("default", pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
-    envs: int = Field(
-        250,
-        ge=1,
-        le=65536,
-        description="environments played together; each meets rallies / envs balls of the same other side",
-    )
-    spin_expected: Expectation | Literal["contract"] = Field(
-        "contract",
-        description="how fast the robot expects balls to spin (env.observation.spin_expected), whatever it was "
-        "trained with; contract: as the policy's says",
-    )
+    envs: Environments = DEFAULT_ENVS
+    spin_expected: PolicyExpectation = "contract"
 
 
 class _Exam(BaseModel):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from common.rally.cholesky import factor, inverse, substitute
+from common.rally.cholesky import factor, inverse, inverse_2, substitute
 
 
 def positive(size: int) -> np.ndarray:
@@ -36,3 +36,14 @@ def test_what_is_not_positive_definite_becomes_nan():
     factor(np.array([[1.0, 2.0], [2.0, 1.0]]), lower)
 
     assert np.isnan(lower[1, 1])
+
+
+def test_the_inverse_of_two_unknowns_is_numpys():
+    matrix = positive(2)
+    found = np.linalg.inv(matrix)
+
+    np.testing.assert_allclose(
+        inverse_2(matrix[0, 0], matrix[1, 0], matrix[1, 1]),
+        [found[0, 0], found[1, 0], found[1, 1]],
+        rtol=1e-9,
+    )
