@@ -28,7 +28,7 @@ from common.real2sim.predict import predict, touch_down
 from common.real2sim.recordings import load_folder
 from common.real2sim.tracks import FEWEST_SAMPLES, Array, RecordingError, Recordings, Track
 
-DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data" / "mpi_ball_gun"
+DATA: Final = Path("../shared/data/mpi_ball_gun")  # from the project, where the command is typed
 LABELS: Final = ("topspin", "backspin", "no_spin")
 SEEN: Final = 0.6  # [-] share of the flight before the bounce that the landing is predicted from
 LONGEST: Final = 2.0  # s; of a predicted flight

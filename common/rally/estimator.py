@@ -68,6 +68,7 @@ BOUNCE_PLACE: Final = 0.002  # [m] sigma that the bounce's own moment adds
 
 GATE: Final = 30.0  # squared distance from the prediction, in sigmas, that a shot is believed up to (3 axes)
 YOUNG: Final = 4  # shots: a fit with fewer has no path that a touch would have to lie on
+FEWEST_SHOTS: Final = 12  # believed, before an estimate is more than a guess
 LONGEST_PAIR: Final = 0.030  # [s] between two unbelieved shots of one path: five of the camera's periods
 FASTEST: Final = 35.0  # [m/s] no ball in play is faster
 PATH_SIGMAS: Final = 25.0  # [-] squared distance between old and new path at a touch, in sigmas of the new
@@ -412,6 +413,13 @@ def estimate_at(row: Array, moment: float) -> tuple[Vec, Vec, int]:
             state = _bounced_state(state, pos)
         rest -= h
     return pos, vel, state
+
+
+@kernel
+def is_guess(row: Array) -> bool:
+    """Return whether what is estimated is still, for the most part, the guess at what balls do that a fit begins with."""
+    few: bool = row[COUNT] < FEWEST_SHOTS
+    return few
 
 
 @kernel

@@ -28,6 +28,7 @@ class BallSample:
     vel: tuple[float, float, float]  # m/s
     state: int  # 0 coming, 1 bounced on the robot's court, 2 hit, 3 landed
     moment: float  # [s] when it was there, on the robot's clock
+    guessed: bool = False  # an estimate of too few shots to be followed yet: ``estimator.is_guess``
 
 
 class Observer:
@@ -85,7 +86,7 @@ class Observer:
         seen[:] = [*ball.pos, *ball.vel, ball.state, ball.moment - now]
         if self._is_first:
             earlier[:] = seen[:6]
-        play.follow_flight(rally.track[0], seen, ball.moment, now, self._is_first, *self._noise)
+        play.follow_flight(rally.track[0], seen, ball.moment, now, self._is_first, ball.guessed, *self._noise)
         self._is_first = False
         obs = np.empty((1, size(policy_layout(self._options))), np.float32)
         play.observe(

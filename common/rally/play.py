@@ -28,7 +28,7 @@ from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, norm, scale, sub
 from common.rally.camera import FILM, READ, TAKEN, begin_film, film_flight, shot_row
 from common.rally.draws import Stream, normal_pair, uniform
-from common.rally.estimator import COUNT, ESTIMATE, begin_estimate, estimate_at, take_shot
+from common.rally.estimator import ESTIMATE, begin_estimate, estimate_at, is_guess, take_shot
 from common.rally.heading import LONGEST_RETURN, heading
 from common.rally.hindsight import BOUNCE, FRESH, HIT, note_hit, note_leaving
 from common.rally.noise import CONDITIONS, MAX_LATENCY_STEPS, NoiseProfile, draw_conditions
@@ -47,7 +47,6 @@ FARTHEST = 1.0e3  # [m] a ball beyond this is a bug, not a rally
 _TAKEN = SAMPLE  # column of ``Rallies.seen``
 NO_SAMPLE = -1.0  # state of a sample that is none: a path ends before it
 NO_TRACKS: Final = new_tracks(0)
-FEWEST_SHOTS = 12  # of the camera, before what the estimator makes of them is followed
 _TOUCHES_A_STEP = 8  # a ball that touches more often inside 5 ms is squeezed between two things: let it be
 
 _TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
@@ -271,6 +270,7 @@ def follow_flight(
     moment: float,
     now: float,
     is_first: bool,
+    guessed: bool,
     position_noise: float,
     velocity_noise: float,
 ) -> None:
@@ -282,10 +282,11 @@ def follow_flight(
         moment: When it was taken [s].
         now: [s].
         is_first: Whether the flight begins with it.
+        guessed: Whether it is an estimator's guess yet (``estimator.is_guess``), of a flight that therefore begins anew.
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
     """
-    if is_first:
+    if is_first or (guessed and seen[6] == 0.0):
         begin_track(track, seen, moment, position_noise, velocity_noise)
         predict(track, now)
     elif seen[6] <= 1.0:
@@ -309,12 +310,16 @@ def _look(rallies: Rallies, b: int, step: int, noise: NoiseProfile) -> None:
     else:
         _sample(rallies, b, step, noise)
     if rallies.track.shape[0] > 0:
-        # An estimator's first estimates are its guess at what balls do: they tell of nothing yet
-        guesses = rallies.eyes.shape[0] > 0 and rallies.eyes[b, FILM + COUNT] < FEWEST_SHOTS
-        is_first = step == 0 or (seen[6] == 0.0 and guesses)
-        now = rallies.clock[b] * GRID_STEP
+        guessed = rallies.eyes.shape[0] > 0 and is_guess(rallies.eyes[b, FILM:])
         follow_flight(
-            rallies.track[b], seen, seen[_TAKEN], now, is_first, noise.position_noise, noise.velocity_noise
+            rallies.track[b],
+            seen,
+            seen[_TAKEN],
+            rallies.clock[b] * GRID_STEP,
+            step == 0,
+            guessed,
+            noise.position_noise,
+            noise.velocity_noise,
         )
 
 

@@ -433,7 +433,7 @@ def _bounce(track: Array, seen: Array, moment: float, velocity_noise: float) -> 
     lower, variance = np.empty((UNKNOWNS, UNKNOWNS)), np.empty((UNKNOWNS, UNKNOWNS))
     factor(track[NORMAL:RIGHT].reshape(UNKNOWNS, UNKNOWNS), lower)
     inverse(lower, variance)
-    surprises = abs(at - moment) > _SURPRISE or at <= 0.0 or then[2] >= 0.0
+    surprises = abs(at - moment) > _SURPRISE or at <= track[BEGUN] or then[2] >= 0.0
     if surprises:
         then = (seen[3], seen[4], -abs(seen[5]))
     covariance = np.empty((6, 6))

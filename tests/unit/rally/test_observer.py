@@ -9,6 +9,8 @@ from common.env.rally_env import EnvConfig, RallyEnv
 from common.env.robot import JOINTS, RobotBatch
 from common.physics.constants import GRID_STEP
 from common.policy.weights import load_policy
+from common.rally.camera import FILM
+from common.rally.estimator import is_guess
 from common.rally.launch import draw_rallies
 from common.rally.noise import Condition
 from common.rally.observation import JOINT_RANGES, ObservationConfig, policy_layout, size
@@ -18,10 +20,11 @@ from tests.unit.env.rallies import Deck, random_actions
 POLICIES = Path(__file__).parents[3] / "assets" / "policies"
 
 
-def ball_of(env: RallyEnv) -> BallSample:
-    """Return what the robot of row 0 goes by, on a clock that began 100 s before the launch."""
-    seen = env.rallies.seen[0]
-    return BallSample(tuple(seen[:3]), tuple(seen[3:6]), int(seen[6]), 100.0 + seen[7])
+def ball_of(env: RallyEnv, launched: float) -> BallSample:
+    """Return what the robot of row 0 goes by, on a clock that stood at ``launched`` at the launch."""
+    seen, eyes = env.rallies.seen[0], env.rallies.eyes
+    guessed = len(eyes) > 0 and bool(is_guess(eyes[0, FILM:]))
+    return BallSample(tuple(seen[:3]), tuple(seen[3:6]), int(seen[6]), launched + seen[7], guessed)
 
 
 def target_of(env: RallyEnv) -> tuple[float, float]:
@@ -36,20 +39,23 @@ def target_of(env: RallyEnv) -> tuple[float, float]:
         {"spin": "hidden", "prediction": False, "age": False},
         {"ball": "filtered", "spin": "hidden", "prediction": False, "age": False},
         {"spin_expected": "strong", "history": 1, "age": False},
+        {"spin_expected": "learnt"},
     ],
 )
-def test_it_sees_what_the_simulated_robot_sees(options):
+@pytest.mark.parametrize("perception", ["cheap", "full"])
+@pytest.mark.parametrize("launched", [100.0, -100.0])
+def test_it_sees_what_the_simulated_robot_sees(options, perception, launched):
     options = ObservationConfig(critic="policy", **options)
-    config = EnvConfig(observation=options, foresee=0.0, go_on=0.0)
+    config = EnvConfig(observation=options, perception=perception, foresee=0.0, go_on=0.0)
     env = RallyEnv(1, config, Deck(draw_rallies(6, seed=2)))
     observer = Observer(options)
     obs, rallies, seen_states = env.reset(), 0, set()
     observer.begin(target_of(env))
     for action in random_actions(env, 160, spread=0.1):
-        now = 100.0 + env.rallies.clock[0] * GRID_STEP
-        mine = observer.observe(now, env.robot.joint_pos[0], env.robot.joint_vel[0], ball_of(env))
+        now = launched + env.rallies.clock[0] * GRID_STEP
+        mine = observer.observe(now, env.robot.joint_pos[0], env.robot.joint_vel[0], ball_of(env, launched))
         np.testing.assert_allclose(mine, obs[0], atol=1e-5)
-        seen_states.add(ball_of(env).state)
+        seen_states.add(int(env.rallies.seen[0, 6]))
         step = env.step(action)
         obs = step.obs
         if step.ended.size:
