@@ -8,9 +8,13 @@
 
 The vector environment is the batch itself (one call steps all robots), not copies of the single one. It starts
 the next episode in the same step; the last observation is ``final_obs``, the rally's facts are ``final_info``.
+
+Observations are the policy's: what only our critic sees, the simulator's truth, is left out whatever the settings say.
+Every rally is an episode that is played to its end, unless ``foresee`` and ``go_on`` are given.
 """
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -21,7 +25,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv
 from common.physics.flight import FULL, SIMPLE
-from common.rally.observation import ACTION, PAPER_OBSERVATION, Part, critic_layout
+from common.rally.observation import ACTION, PAPER_OBSERVATION, Part, policy_layout
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -38,6 +42,8 @@ def _box(layout: tuple[Part, ...]) -> spaces.Box:
 
 
 ACTION_SPACE = _box(ACTION)
+DEFAULTS: Final[Mapping[str, Any]] = {"observation": PAPER_OBSERVATION, "foresee": 0.0, "go_on": 0.0}
+"""Where the environment that others train on differs from the actors'."""
 
 
 class _Table:
@@ -45,8 +51,11 @@ class _Table:
 
     def __init__(self, count: int, stage: int, launch: str, settings: dict[str, Any]) -> None:
         self._count, self._stage, self._launch = count, stage, launch
-        self._config = EnvConfig(**({"observation": PAPER_OBSERVATION} | settings))
-        self.observation_space = _box(critic_layout(self._config.observation))
+        given = EnvConfig(**(DEFAULTS | settings))
+        seen = given.observation.model_copy(update={"critic": "policy"})
+        # Nobody here is told what the last actions before a hit should have been
+        self._config = given.model_copy(update={"observation": seen, "hindsight": False})
+        self.observation_space = _box(policy_layout(seen))
         self.env: RallyEnv | None = None
 
     def begin(self, seed: int) -> Floats:
@@ -91,7 +100,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         stage: Curriculum stage 1..3, the reward's column.
         launch: Launch preset of the rallies.
         render_mode: None: films are made from recorded rallies.
-        settings: Fields of ``EnvConfig``: ``noise="off"``, ``control_rate_hz=200`` ...
+        settings: Fields of ``EnvConfig``: ``noise="off"``, ``control_rate_hz=200`` ... over ``DEFAULTS``.
     """
 
     metadata = {"render_modes": [], "render_fps": 50}  # noqa: RUF012  # Gymnasium's own name and form
@@ -144,7 +153,7 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         stage: Curriculum stage 1..3, the reward's column.
         launch: Launch preset of the rallies.
         render_mode: None: films are made from recorded rallies.
-        settings: Fields of ``EnvConfig``.
+        settings: Fields of ``EnvConfig``, over ``DEFAULTS``.
     """
 
     metadata = {  # noqa: RUF012  # Gymnasium's own name and form

@@ -1,7 +1,7 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,8 @@ from services.evaluator.measures import Played
 
 DEFAULT_ENVS = 250
 EPISODES_EACH = 4  # whole ones that an environment has rallies for
+TRAINING_ONLY: Final[Mapping[str, Any]] = {"go_on": 0.0, "foresee": 0.0, "hindsight": False}
+"""What only training asks for has no place in a match: every flight is played to its end, and nobody is taught."""
 
 # Settings of every command that plays a match
 Environments = Annotated[
@@ -105,8 +107,7 @@ def play_match(
     """
     envs = environments(len(rallies.seeds), envs, config.rounds)
     filler = draw_rallies(64, seed=0, noise=config.noise, purpose=Purpose.FALLBACK)
-    # What only training asks for has no place in a match: every flight is played to its end, and nobody is taught.
-    task = config.model_copy(update={"go_on": 0.0, "foresee": 0.0, "hindsight": False})
+    task = config.model_copy(update=dict(TRAINING_ONLY))
     env = RallyEnv(envs, task, FixedRallies(rallies, filler), stage=3, path_rows=rallies.path_rows)
     obs = env.reset()
     ended: list[FinishedRallies] = []

@@ -3,7 +3,7 @@
 import csv
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from threading import Event
 from typing import Any
 
@@ -21,12 +21,13 @@ from common.policy.weights import (
     new_network,
     observation_moments,
     save_policy,
+    task_hash,
     unpack,
 )
 from common.rally.observation import critic_layout
 from common.run_folder import RunFolder
 from services.evaluator.config import EvaluatorConfig
-from services.evaluator.match import evaluation_rallies, play_match
+from services.evaluator.match import TRAINING_ONLY, evaluation_rallies, play_match
 from services.evaluator.measures import measures
 
 log = logging.getLogger(__name__)
@@ -64,10 +65,21 @@ def score(stage: int, found: dict[str, Any]) -> tuple[int, float]:
     return stage, (found["return_rate"] or 0.0) - (error if error is not None else 1.0)
 
 
+def match_of(config: EvaluatorConfig) -> dict[str, Any]:
+    """Return what is played, as it stands beside a policy's measures."""
+    return {"rallies": config.rallies, "launch": config.launch, "noise": config.noise, "rounds": config.rounds}
+
+
 def measured_alike(contract: Contract, config: EvaluatorConfig) -> bool:
-    """Return whether a policy's measures are of as many balls of the same kind, seen alike, as ``config`` asks for."""
-    theirs = (contract.measures.get("rallies"), contract.launch, contract.noise, contract.observation_options)
-    return theirs == (config.rallies, config.launch, config.env.noise, config.env.observation)
+    """Return whether a policy's measures are of as many balls of the same kind, in the same task, as ``config`` asks for."""
+    match = match_of(config)
+    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}  # to a match, whose noise and rounds are its own
+
+    def task(env: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in env.items() if name not in irrelevant}
+
+    theirs = {name: contract.measures.get(name) for name in match}
+    return theirs == match and task(contract.env) == task(config.env.model_dump(mode="json"))
 
 
 class EvaluatorService:
@@ -91,6 +103,7 @@ class EvaluatorService:
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
         self._network = new_network(config.network, config.env.observation)
+        self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._incarnation = incarnation
         self._keys = keys = Keys(config.run)
         self._control = transport.serve(keys.ctl("evaluator", config.id), capacity=16)
@@ -191,6 +204,11 @@ class EvaluatorService:
     def _evaluate(self, snapshot: PolicySnapshot) -> None:
         started = self._clock()
         try:
+            if snapshot.contract_hash != self._contract_hash:
+                raise PolicyError(
+                    f"policy has contract {snapshot.contract_hash}, this evaluator has {self._contract_hash}: "
+                    "start both with the same network, env and launch settings"
+                )
             unpack(self._network, snapshot.weights)
             moments = observation_moments(
                 snapshot.obs_mean,
@@ -239,7 +257,7 @@ class EvaluatorService:
                 self._folder.best_policy,
                 policy.network,
                 policy.moments,
-                contract.model_copy(update={"measures": found}),
+                contract.model_copy(update={"measures": match_of(self._config) | found}),
             )
 
     def _contract(self, snapshot: PolicySnapshot) -> Contract:

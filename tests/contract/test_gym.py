@@ -11,7 +11,7 @@ from gymnasium.wrappers import vector
 
 from common.env.gym import ENV_ID
 from common.env.rally_env import EnvConfig
-from common.rally.observation import PAPER_OBSERVATION
+from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
 from common.rally.trajectory import Outcome
 from tests.unit.env.rallies import make_env
 
@@ -187,8 +187,21 @@ def test_settings_reach_the_environment():
     env = make(stage=1, noise="off", control_rate_hz=200).unwrapped
     env.reset(seed=1)
 
-    assert env._table.env.config == EnvConfig(noise="off", control_rate_hz=200, observation=PAPER_OBSERVATION)
+    played = EnvConfig(
+        noise="off", control_rate_hz=200, observation=PAPER_OBSERVATION, foresee=0.0, go_on=0.0, hindsight=False
+    )
+    assert env._table.env.config == played
     assert env._table.env.stage == 1
+
+
+@pytest.mark.parametrize("observation", [ObservationConfig(), {"history": 4}, PAPER_OBSERVATION])
+def test_the_simulators_truth_is_in_no_observation(observation):
+    """The options of a policy in the box say what its critic saw in training."""
+    seen = size(policy_layout(ObservationConfig.model_validate(observation)))
+    env, envs = make(observation=observation), make_vec(4, observation=observation)
+
+    assert env.observation_space.shape == env.reset(seed=1)[0].shape == (seen,)
+    assert envs.observation_space.shape == envs.reset(seed=1)[0].shape == (4, seen)
 
 
 def test_an_unknown_setting_is_refused():

@@ -13,7 +13,8 @@ from common.comms.messages import VerdictKind
 from common.comms.transport import TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.policy.weights import load_policy
+from common.env.rally_env import EnvConfig
+from common.policy.weights import load_policy, save_policy
 from services.actor.service import NoRalliesError
 from services.learner.checkpoint import checkpoints
 from services.learner.intake import IntakeConfig
@@ -243,19 +244,33 @@ def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
         wait_until(
             lambda: progress(learner).stage == 3 and evaluator.service.evaluations > 1, 60, "an evaluation"
         )
-        wait_until((tmp_path / "policy" / "best").exists, 10, "a best policy")
+        folder = tmp_path / "policy" / "best"
+        wait_until(folder.exists, 10, "a best policy")
         s.take_down(evaluator)
-        best = load_policy(tmp_path / "policy" / "best").contract
+        best = load_policy(folder)
+        measures = best.contract.measures | {"return_rate": 1.0, "target_error_mean": 0.0}  # not to be beaten
+        unbeaten = best.contract.model_copy(update={"stage": 3, "measures": measures})
+        save_policy(folder, best.network, best.moments, unbeaten)
         again = s.evaluator()
-        wait_until(lambda: again.service.evaluations >= 1, 30, "an evaluation of the next life")
+        wait_until(lambda: again.service.evaluations >= 2, 30, "evaluations of the next life")
         s.take_down(again)
-        kept = load_policy(tmp_path / "policy" / "best").contract
+        kept = load_policy(folder).contract
 
-    def score(contract):
-        return contract.stage, contract.measures["return_rate" if contract.stage == 3 else "catch_rate"]
+    assert kept == unbeaten
 
-    assert score(kept) >= score(best)
-    assert again.service._best is not None
+
+def test_an_evaluator_of_another_task_refuses_the_policy_as_actors_do(tmp_path, caplog):
+    """Its shapes fit: it would play with other settings than the policy's, and keep it with a wrong contract."""
+    with stage(tmp_path, curriculum=LONG) as s:
+        s.learner()
+        stranger = s.evaluator(env=EnvConfig(control_rate_hz=100))
+        wait_until(
+            lambda: stranger.metric("topspin_messages_refused_total", kind="policy") > 0, 30, "a refusal"
+        )
+
+    assert stranger.service.evaluations == 0
+    assert "start both with the same network, env and launch settings" in caplog.text
+    assert not (tmp_path / "policy" / "best").exists()
 
 
 def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):

@@ -7,7 +7,7 @@ from common.policy.weights import contract_of
 from common.rally.trajectory import Outcome
 from services.evaluator.config import EvaluatorConfig
 from services.evaluator.measures import measures, wilson
-from services.evaluator.service import measured_alike, score
+from services.evaluator.service import match_of, measured_alike, score
 from tests.unit.evaluator.played import make_played
 
 
@@ -85,7 +85,11 @@ def test_best_is_a_later_stage_then_a_percent_of_balls_against_a_centimetre():
         ({}, True),
         ({"rallies": 500}, False),
         ({"launch": "strong"}, False),
-        ({"env": {"noise": "hard"}}, False),
+        ({"noise": "hard"}, False),
+        ({"rounds": 5}, False),
+        ({"env": {"collision": "original"}}, False),
+        ({"env": {"control_rate_hz": 100}}, False),
+        ({"env": {"reward": {"heading": 0.0}, "foresee": 0.0}}, True),
         ({"env": {"observation": {"spin_expected": "strong"}}}, False),
         ({"seed": 4, "interval_s": 5.0}, True),
     ],
@@ -95,6 +99,6 @@ def test_a_best_that_was_measured_on_other_balls_is_no_best(now, alike):
     kept = EvaluatorConfig()
     contract = contract_of(
         kept.env, kept.network, kept.launch, run="r", generation=1, version=1, stage=3, frames=1
-    ).model_copy(update={"measures": {"rallies": kept.rallies}})
+    ).model_copy(update={"measures": match_of(kept)})
 
     assert measured_alike(contract, EvaluatorConfig(**now)) == alike
