@@ -6,7 +6,6 @@ Two models of the coefficients. On 1,597 recorded flights of 0.3 s the simple on
 the truth and the full one 35 mm; drag alone lands 188 mm away, and a lift that never saturates 65 mm.
 """
 
-import math
 from typing import Final
 
 import numpy as np
@@ -176,10 +175,3 @@ def flight_step(
             vel[2] + sixth * (a_1[2] + 2.0 * (a_2[2] + a_3[2]) + a_4[2]),
         ),
     )
-
-
-@kernel
-def decayed_spin(spin: Vec, h: float, tau: float) -> Vec:
-    """Return the spin ``h`` seconds later by w' = -w/tau (option; tau is 10 s or more, inf keeps it)."""
-    left = math.exp(-h / tau)
-    return (left * spin[0], left * spin[1], left * spin[2])

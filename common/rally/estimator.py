@@ -417,7 +417,7 @@ def estimate_at(row: Array, moment: float) -> tuple[Vec, Vec, int]:
 
 @kernel
 def is_guess(row: Array) -> bool:
-    """Return whether what is estimated is still, for the most part, the guess at what balls do that a fit begins with."""
+    """Return whether an estimate is, for the most part, still the guess at what balls do that its fit began with."""
     few: bool = row[COUNT] < FEWEST_SHOTS
     return few
 

@@ -282,7 +282,7 @@ def follow_flight(
         moment: When it was taken [s].
         now: [s].
         is_first: Whether the flight begins with it.
-        guessed: Whether it is an estimator's guess yet (``estimator.is_guess``), of a flight that therefore begins anew.
+        guessed: Whether it is but an estimator's guess (``estimator.is_guess``): then the flight begins anew with it.
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
     """

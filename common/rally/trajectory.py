@@ -80,11 +80,6 @@ CONTINUES_AS: dict[State, State] = {
     State.TAU_3: State.TAU_30,
 }
 
-CAUGHT_OUTCOMES = frozenset(
-    {Outcome.RETURNED, Outcome.NET, Outcome.OUT, Outcome.OWN_COURT, Outcome.EDGE, Outcome.DOUBLE_HIT}
-)
-"""Outcomes that always follow a legal racket contact (BODY and TIME_OUT may or may not)."""
-
 OUTCOME_OFFSET = 100
 
 

@@ -67,13 +67,19 @@ def score(stage: int, found: dict[str, Any]) -> tuple[int, float]:
 
 def match_of(config: EvaluatorConfig) -> dict[str, Any]:
     """Return what is played, as it stands beside a policy's measures."""
-    return {"rallies": config.rallies, "launch": config.launch, "noise": config.noise, "rounds": config.rounds}
+    return {
+        "rallies": config.rallies,
+        "launch": config.launch,
+        "noise": config.noise,
+        "rounds": config.rounds,
+    }
 
 
 def measured_alike(contract: Contract, config: EvaluatorConfig) -> bool:
-    """Return whether a policy's measures are of as many balls of the same kind, in the same task, as ``config`` asks for."""
+    """Return whether a policy was measured as ``config`` asks for: as many balls of the same kind, in the same task."""
     match = match_of(config)
-    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}  # to a match, whose noise and rounds are its own
+    # To a match, whose noise and rounds are its own
+    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}
 
     def task(env: Mapping[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in env.items() if name not in irrelevant}

@@ -188,7 +188,12 @@ def test_settings_reach_the_environment():
     env.reset(seed=1)
 
     played = EnvConfig(
-        noise="off", control_rate_hz=200, observation=PAPER_OBSERVATION, foresee=0.0, go_on=0.0, hindsight=False
+        noise="off",
+        control_rate_hz=200,
+        observation=PAPER_OBSERVATION,
+        foresee=0.0,
+        go_on=0.0,
+        hindsight=False,
     )
     assert env._table.env.config == played
     assert env._table.env.stage == 1

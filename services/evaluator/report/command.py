@@ -56,7 +56,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
 
     found = results(runs, config, lambda: check(stop))
     for line in found.missing:
-        log.warning("missing %s", line)
+        log.warning("missing or unequal %s", line)
     out = Path(config.out)
     try:
         out.mkdir(parents=True, exist_ok=True)

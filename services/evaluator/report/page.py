@@ -11,7 +11,7 @@ import jinja2
 from common.errors import ReportedError
 from services.evaluator.report import tables
 from services.evaluator.report.figures import Drawing
-from services.evaluator.report.results import NOISE, Results, as_json
+from services.evaluator.report.results import NOISE, Results, as_json, mean_of
 from services.evaluator.report.tables import Table, markdown
 
 TITLE = "Topspin: what the runs came to"
@@ -47,7 +47,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
             ),
         ),
         Section("In words", note(config.note)),
-        Section("Missing", missing=found.missing),
+        Section("Missing or unequal", missing=found.missing),
         Section("Beside the paper", tables=(tables.headline(found),)),
         Section("Training", drawings=named("curves")),
         Section("Every seed", tables=(tables.by_seed(found),)),
@@ -93,6 +93,9 @@ def _commands(found: Results) -> str:
         for result in one.runs:
             took = f"{tables.count_of(result.frames)} frames in {tables.hours_of(result.seconds)}"
             lines.append(f"{result.command}  # seed {result.seed}, {took}")
+            if parts := mean_of(result.run.policy):
+                lines.append(f"# ... and trained on from there: its policy is the mean of {len(parts)}")
+                lines += [f"#     {part}" for part in parts]
         lines.append("")
     config = found.settings
     runs = " ".join(result.run.name for one in found.groups for result in one.runs)

@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 
 NOISE: Final = "standard"  # every figure is measured with it
 ROUNDS: Final = 5  # rallies an episode, where rounds are asked for
+UNEQUAL: Final = 1.1  # [-] runs of one experiment whose frames differ by more are said to
 FIGURES: Final = (
     "catch_rate",
     "over_rate",
@@ -96,7 +97,7 @@ class Results:
     settings: ReportConfig
     versions: Mapping[str, str]
     machine: Mapping[str, str]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # what isn't there, or keeps figures from being comparable, in words
 
 
 def evaluation_task(policy: Policy, rounds: int = 1) -> EnvConfig:
@@ -120,7 +121,7 @@ def results(runs: Sequence[Run], config: ReportConfig, breathe: Callable[[], Non
         for one in group(runs)
     )
     missing = tuple(f"{run.name}: {what}" for run in runs for what in run.missing)
-    return Results(groups, config, versions(), machine(), missing)
+    return Results(groups, config, versions(), machine(), missing + tuple(inequalities(groups)))
 
 
 def _of_run(
@@ -165,6 +166,24 @@ def _of_group(one: Group, runs: Sequence[RunResult]) -> GroupResult:
         by=breakdown(played) if played is not None else {},
         survival=survival(went_on) if went_on is not None else {},
     )
+
+
+def inequalities(groups: Sequence[GroupResult]) -> Iterator[str]:
+    """Return in words where runs that are taken together are no seeds of one experiment."""
+    for one in groups:
+        frames = [result.frames for result in one.runs if result.frames]
+        if frames and max(frames) > UNEQUAL * min(frames):
+            longest, shortest = max(frames) / 1e6, min(frames) / 1e6
+            yield f"{one.label}: its runs are of different length, {shortest:.1f} to {longest:.1f} M frames"
+        twice = sorted({seed for seed in one.seeds if one.seeds.count(seed) > 1})
+        if twice:
+            yield f"{one.label}: several runs of seed {', '.join(map(str, twice))}"
+
+
+def mean_of(policy: Policy | None) -> tuple[str, ...]:
+    """Return what a policy is the mean of, run by run; () of one that was trained as it is."""
+    parts = policy.contract.made_with.get("mean_of", "") if policy is not None else ""
+    return tuple(parts.split("; ")) if parts else ()
 
 
 def _pooled(parts: Sequence[Played | None]) -> Played | None:
@@ -221,7 +240,7 @@ def _run_json(result: RunResult) -> dict[str, Any]:
         "frames": result.frames,
         "seconds": result.seconds,
         "stage_changes": [list(change) for change in run.training.stage_changes()] if run.training else [],
-        "policy": of_policy,
+        "policy": of_policy | {"mean_of": list(mean_of(policy))},
         "measures": dict(result.measures),
         "by": breakdown(result.played) if result.played is not None else {},
         "survival": survival(result.went_on) if result.went_on is not None else {},

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from common.policy.weights import Policy
 from common.rally.trajectory import Outcome
 from services.evaluator.breakdown import BREAKDOWNS
-from services.evaluator.report.results import GroupResult, Results, RunResult, Spread
+from services.evaluator.report.results import GroupResult, Results, RunResult, Spread, mean_of
 
 NOTHING: Final = "–"
 
@@ -87,8 +88,15 @@ def _metre_cell(found: Spread | None, interval: Sequence[float] | None) -> str:
     return _cell(found, interval, 1, 3, "m")
 
 
-def _seeds(count: int) -> str:
-    return "1 seed" if count == 1 else f"{count} seeds"
+def _policies(one: GroupResult) -> str:
+    """Return how many policies a row is of, and how many seeds, or trained policies, stand behind them."""
+    played = [result for result in one.runs if result.played is not None]
+    seeds = len({result.seed for result in played})
+    text = "1 seed" if seeds == 1 else f"{seeds} seeds"
+    if len(played) > seeds:
+        text = f"{len(played)} runs of {text}"
+    parts = sum(len(mean_of(result.run.policy)) for result in played)
+    return f"{text}, mean of {parts} policies" if parts else text
 
 
 def count_of(frames: int | None) -> str:
@@ -114,7 +122,7 @@ def headline(found: Results) -> Table:
             continue
         rows.append(
             (
-                f"Topspin, {one.label} ({_seeds(one.spread['catch_rate'].seeds)})",
+                f"Topspin, {one.label} ({_policies(one)})",
                 "yes",
                 _rate_cell(one.spread.get("return_rate"), one.pooled["return_rate_ci"]),
                 _rate_cell(one.spread.get("return_after_catch"), one.pooled["return_after_catch_ci"]),
@@ -127,7 +135,8 @@ def headline(found: Results) -> Table:
         tuple(rows),
         frozenset(range(len(PAPER), len(rows))),
         "Ours: mean ± standard deviation over seeds, and in brackets the 95 % interval of all their rallies "
-        "(Wilson for rates, normal for the error; it holds for these policies, not for the next seed). The others "
+        "(Wilson for rates, normal for the error; as if each seed had met other balls, and of these policies, not of "
+        "the next seed). The others "
         "are as Hu et al. 2025 print them, with the works named that the rows come from; balls, robots and "
         "simulators differ.",
     )
@@ -154,13 +163,19 @@ def _run_row(one: GroupResult, result: RunResult) -> tuple[str, ...]:
         str(result.seed),
         count_of(result.frames),
         hours_of(result.seconds),
-        NOTHING if policy is None else f"{count_of(policy.contract.frames)}, stage {policy.contract.stage}",
+        NOTHING if policy is None else _origin(policy),
         *(percent(m.get(name)) for name in ("catch_rate", "over_rate", "return_rate", "return_after_catch")),
         metres(m.get("target_error_mean"), 3),
         metres(m.get("target_error_median"), 3),
         percent(m.get("within_0.2_m")),
         percent(m.get("within_0.3_m")),
     )
+
+
+def _origin(policy: Policy) -> str:
+    parts = mean_of(policy)
+    mean = f"mean of {len(parts)}, to " if parts else ""
+    return f"{mean}{count_of(policy.contract.frames)}, stage {policy.contract.stage}"
 
 
 def outcomes(found: Results) -> Table:

@@ -6,6 +6,7 @@ import pytest
 
 from common.env.robot import RACKET_BODY, load_model
 from common.physics import arm, touch
+from common.physics.constants import TABLE_HALF_LENGTH, TABLE_HALF_WIDTH, TABLE_THICKNESS
 
 MODEL = load_model()
 RANGES = np.array(MODEL.jnt_range)
@@ -94,6 +95,13 @@ def test_blade_and_beam_are_the_models():
     assert beam.size[0] == arm.BEAM_RADIUS
     assert beam.size[1] == arm.BEAM_HALF_LENGTH
     np.testing.assert_allclose(MODEL.body("beam").pos, [arm.RAIL_HOME_X, 0.0, arm.BEAM_Z])
+
+
+def test_the_table_of_the_simulator_is_the_balls():
+    table = MODEL.geom("table")
+
+    np.testing.assert_allclose(2 * table.size, [2 * TABLE_HALF_LENGTH, 2 * TABLE_HALF_WIDTH, TABLE_THICKNESS])
+    assert table.pos[2] == -table.size[2]  # its top is where heights begin
 
 
 def test_a_ball_beside_a_link_is_as_far_from_it_as_mujoco_says():

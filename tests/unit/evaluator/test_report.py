@@ -15,7 +15,15 @@ from common.env.rally_env import EnvConfig
 from common.errors import ReportedError
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments
-from common.policy.weights import ACTION_CONTRACT, Contract, new_network, observation_contract, save_policy
+from common.policy.weights import (
+    ACTION_CONTRACT,
+    Contract,
+    load_policy,
+    mean_policy,
+    new_network,
+    observation_contract,
+    save_policy,
+)
 from common.rally.observation import critic_layout, size
 from services.evaluator import report
 from services.evaluator.measures import measures
@@ -31,6 +39,7 @@ from services.evaluator.report.results import (
     Results,
     RunResult,
     evaluation_task,
+    inequalities,
     spread,
 )
 from services.evaluator.report.tables import PAPER, Table, headline, markdown
@@ -300,6 +309,37 @@ def test_policies_are_measured_on_our_task_whatever_they_were_trained_on(tmp_pat
     task = evaluation_task(policy)
     assert (task.noise, task.collision, task.rounds, task.control_rate_hz) == ("standard", "tailored", 1, 50)
     assert task.observation == policy.contract.observation_options
+
+
+def test_runs_of_unequal_length_or_of_one_seed_are_said_to_be():
+    def of(*frames_and_seeds):
+        runs = tuple(
+            RunResult(make_run(), seed, "", frames, None, None, None, {}) for frames, seed in frames_and_seeds
+        )
+        return GroupResult("ours", "", runs, None, {}, {}, {}, {})
+
+    assert not [*inequalities([of((10_000_000, 0), (10_002_432, 1), (None, 2))])]
+    assert [*inequalities([of((10_000_000, 0), (60_000_000, 1)), of((5, 3), (5, 3))])] == [
+        "ours: its runs are of different length, 10.0 to 60.0 M frames",
+        "ours: several runs of seed 3",
+    ]
+
+
+def test_a_mean_of_policies_is_said_to_be_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    best = write_run(tmp_path, "a") / "policy" / "best"
+    policy = load_policy(best)
+    mean = mean_policy([policy, policy])
+    save_policy(best, mean.network, mean.moments, mean.contract)
+
+    command.main(["a", "--rallies", "24", "--envs", "24", "--out", "o"], Event())
+
+    page = (tmp_path / "o" / "report.md").read_text()
+    assert "| **Topspin, stages 1+2+3 (1 seed, mean of 2 policies)** |" in page
+    assert "mean of 2, to 0.0 M, stage 2" in page
+    assert "its policy is the mean of 2\n#     a 3000 frames, launch paper\n#     a 3000 frames" in page
+    found = json.loads((tmp_path / "o" / "results.json").read_text())
+    assert found["groups"][0]["runs"][0]["policy"]["mean_of"] == ["a 3000 frames, launch paper"] * 2
 
 
 def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):

@@ -12,7 +12,6 @@ from common.physics.flight import (
     FULL,
     SIMPLE,
     acceleration,
-    decayed_spin,
     flight_step,
     full_drag,
     full_magnus,
@@ -197,10 +196,3 @@ def test_full_lift_per_volume_equals_lift_per_area():
 
     assert lift == pytest.approx(AIR_FACTOR * C_L * speed**2)
     assert pytest.approx(8.0 / 3.0 * BALL_RADIUS) == AIR_VOLUME_FACTOR / AIR_FACTOR
-
-
-def test_spin_decays_to_1_over_e_in_tau_and_never_where_tau_is_infinite():
-    spin = (30.0, -250.0, 60.0)
-
-    np.testing.assert_allclose(decayed_spin(spin, 12.0, 12.0), np.array(spin) / math.e)
-    assert decayed_spin(spin, 0.5, math.inf) == spin

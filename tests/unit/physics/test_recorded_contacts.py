@@ -12,7 +12,7 @@ RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "racket_c
 
 pytestmark = pytest.mark.skipif(
     not RECORDINGS.is_dir(),
-    reason=f"no recordings in {RECORDINGS.parent}: see docs for where to download them",
+    reason=f"no samples in {RECORDINGS}, which were copied from the papers that constants.py names for rubbers",
 )
 
 

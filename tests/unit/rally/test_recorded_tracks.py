@@ -10,7 +10,7 @@ from common.rally.estimator import track
 RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "mpi_ball_gun"
 
 pytestmark = pytest.mark.skipif(
-    not RECORDINGS.is_dir(), reason=f"no recordings in {RECORDINGS}: see README.md for where to download them"
+    not RECORDINGS.is_dir(), reason=f"no recordings in {RECORDINGS}: docs/real2sim.md says whose they are"
 )
 
 TABLE_TOP = 0.739  # m, in the recordings' frame
