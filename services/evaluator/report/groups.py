@@ -66,12 +66,16 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     more += SPINS[seen.get("spin", "hidden")]
     more += ["prediction"] if seen.get("prediction", False) else []
     more += ["sample age"] if seen.get("age", False) else []
-    told = "" if more == USUAL else " + ".join(more) or "37 numbers"
+    filtered = seen.get("ball", "sampled") == "filtered"
+    own = "37 numbers, ball filtered" if filtered else "37 numbers"
+    told = " + ".join([own, *more] if filtered or not more else more)
+    if more == USUAL:
+        told = "ball filtered" if filtered else ""
     critic = seen.get("critic", "policy")
     return (
         (stages, stages),
         (collision, "" if collision == "tailored collisions" else collision),
-        (" + ".join(["sees 37 numbers", *more]), told),
+        (" + ".join([f"sees {own}", *more]), told),
         ("critic sees the truth", "")
         if critic == "privileged"
         else ("critic sees what the policy does", "critic sees no more"),

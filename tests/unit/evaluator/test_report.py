@@ -166,6 +166,8 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("e", env={"observation": {"critic": "policy", "spin": "estimated", "age": True}}),
             make_run("f", env={"observation": {"critic": "privileged", "prediction": True}}),
             make_run("g", env={"observation": {"critic": "privileged"} | usual}),
+            make_run("h", env={"observation": {"critic": "privileged", "ball": "filtered"}}),
+            make_run("i", env={"observation": {"critic": "privileged", "ball": "filtered"} | usual}),
         ]
     )
 
@@ -177,6 +179,8 @@ def test_groups_are_called_by_what_tells_them_apart():
         "stages 1+2+3, estimated spin + sample age, critic sees no more",
         "stages 1+2+3, prediction",
         "stages 1+2+3",
+        "stages 1+2+3, 37 numbers, ball filtered",
+        "stages 1+2+3, ball filtered",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"
