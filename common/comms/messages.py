@@ -23,8 +23,8 @@ U64 = npt.NDArray[np.uint64]
 I32 = npt.NDArray[np.int32]
 
 Count = Annotated[int, Wire("1", low=0, high=2**62)]
-# Of an actor's incarnation. The learner remembers each: a wild one must not cost it its memory.
-Sequence = Annotated[int, Wire("1", low=0, high=4_000_000)]
+# Of an actor's incarnation. Out of reach at any rate (4 a second: 70 million years), and whole as a heartbeat's float.
+Sequence = Annotated[int, Wire("1", low=0, high=2**53)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
 Numbers = Annotated[Mapping[str, float], Wire("by name")]

@@ -17,15 +17,6 @@ from services.learner.ledger import Ledger, Remembered
 from services.learner.verdicts import Header, Standing
 from tests.unit.services.accounting import ROLLOUT, STANDING, make_header
 
-
-@pytest.fixture(scope="module", autouse=True)
-def a_short_memory():
-    """Let the ledger fold all but the newest rollouts: it must make no difference."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("services.learner.ledger.RECENT", 1)
-        yield
-
-
 OUTBOX = OutboxConfig(retry_first_s=1.0, retry_max_s=4.0, give_up_s=30.0)
 INTAKE = IntakeConfig(dataset_rollouts=2, max_lag=1, queue_rollouts=3)
 
