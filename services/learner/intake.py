@@ -120,17 +120,26 @@ class Intake:
         return self._verdict(VerdictKind.UNREADABLE, VerdictKind.UNREADABLE, reason)
 
     def report(self, report: ActorReport, now: float) -> Verdict:
-        """Return fresh credits for an actor, which is alive if it says so, whatever was thought."""
+        """Return fresh credits for an actor, which is alive if it says so, unless its token has gone since.
+
+        News of a death overtakes what the dead said last. Whoever was only cut off is seen again, and then heard.
+        """
         account = self._heard(report.actor, report.incarnation, now)
         account.hear(report, self._standing.generation)
-        account.is_alive = not report.leaving
+        account.is_alive = not (report.leaving or account.is_out_of_sight)
         self._grant(account, now)
         return self._verdict(VerdictKind.CREDITS, VerdictKind.CREDITS, "", account.credit_limit)
 
     def gone(self, actor: str, incarnation: int) -> None:
         """Note that an actor died or left: what it had under way is lost, its credits are free."""
         account = self._accounts.setdefault((actor, incarnation), Account(actor, incarnation))
-        account.is_alive = False
+        account.is_alive, account.is_out_of_sight = False, True
+
+    def seen(self, actor: str, incarnation: int) -> None:
+        """Note that an actor's token is in sight: one that had gone is back, and what it has under way may come."""
+        account = self._accounts.get((actor, incarnation))
+        if account is not None and account.is_out_of_sight:
+            account.is_alive, account.is_out_of_sight = True, False
 
     def take_dataset(self) -> tuple[Queued, ...]:
         """Return the rollouts of the next dataset, oldest first, and start its update; () while too few wait.
@@ -160,12 +169,6 @@ class Intake:
                 self._queue.append(entry)
             else:
                 self._settle(entry, Fate.LOST)
-
-    def abandon_update(self) -> None:
-        """Write the dataset down as lost: its update failed or was interrupted."""
-        for entry in self._in_update:
-            self._settle(entry, Fate.LOST)
-        self._in_update = ()
 
     def ledgers(self) -> dict[tuple[str, int], Ledger]:
         """Return the account of every (actor, incarnation)."""

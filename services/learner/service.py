@@ -370,8 +370,8 @@ class LearnerService:
             (self._alive.add if event.alive else self._alive.discard)(
                 (member.role, member.id, member.incarnation)
             )
-            if member.role == "actor" and not event.alive:
-                self._intake.gone(member.id, member.incarnation)
+            if member.role == "actor":
+                (self._intake.seen if event.alive else self._intake.gone)(member.id, member.incarnation)
         for _ in range(SERVED_AT_ONCE):
             request = self._rollouts.poll()
             if request is None:
