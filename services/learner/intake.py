@@ -13,9 +13,9 @@ short episodes. An actor without credits reports until it gets some: no grant ca
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
 from services.learner.ledger import Account, Fate, Ledger, Outcome, Remembered, restored
@@ -37,7 +37,9 @@ class IntakeConfig(BaseModel):
         2, ge=0, le=64, description="versions that a rollout may be behind; 0 is strictly synchronous"
     )
     target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
-    queue_rollouts: int = Field(256, ge=1, description="rollouts that may wait; bounds the memory")
+    queue_rollouts: int = Field(
+        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
+    )
     window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
     credit_patience_s: float = Field(
         30.0,
@@ -45,6 +47,14 @@ class IntakeConfig(BaseModel):
         description="silence after which an actor's unused credits go to others",
         json_schema_extra={"unit": "s"},
     )
+
+    @model_validator(mode="after")
+    def _a_dataset_fits_into_the_queue(self) -> Self:
+        if self.dataset_rollouts > self.queue_rollouts:
+            raise ValueError(
+                f"dataset_rollouts {self.dataset_rollouts}; allowed: up to queue_rollouts, {self.queue_rollouts}"
+            )
+        return self
 
     @property
     def lag_aimed_at(self) -> int:
