@@ -220,7 +220,7 @@ class LearnerService:
             trained_seconds=self.seconds,
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
-        if self.training.progress.health.is_good:
+        if self.training.progress.is_worth_going_back_to:
             checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
         save_policy(
             self._folder.latest_policy, self.training.average, self.training.obs_moments, self._contract()

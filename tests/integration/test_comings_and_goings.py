@@ -276,6 +276,18 @@ def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it
     assert bool(weights.isfinite().all())
 
 
+def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
+    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        begun = LONG.stage_1 + LONG.stage_2
+        wait_until(lambda: progress(learner).epoch > begun, 60, "stage 3")
+        kept = [path.stem for path in checkpoints(tmp_path / "checkpoints" / "good")]
+
+    assert kept == [f"{begun:08d}"]
+
+
 def test_a_run_that_diverges_with_nothing_to_go_back_to_ends_with_one_line(tmp_path):
     with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
         learner = s.learner()
