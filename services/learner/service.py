@@ -341,9 +341,6 @@ class LearnerService:
                 obs_mean=training.obs_moments.mean,
                 obs_var=training.obs_moments.var,
                 obs_count=training.obs_moments.count,
-                value_mean=float(training.value_moments.mean),
-                value_var=float(training.value_moments.var),
-                value_count=training.value_moments.count,
             )
         )
 

@@ -151,7 +151,7 @@ BAD_OBS[2, 1, 3] = np.inf
         ("rewards", ["<f4", [2**62, 2**62], b""], r"Rollout.rewards: shape"),
         ("rewards", 7, "Rollout.rewards: 7; allowed: an array"),
         ("terminated", ["|b1", [3, 2], b"\0\0\0\0\0\2"], r"Rollout.terminated\[2, 1\]: 2; allowed: 0 to 1"),
-        ("rally_flags", raw_array(np.full((3, 2), 8, np.uint8)), r"rally_flags\[0, 0\]: 8; allowed: 0 to 1"),
+        ("final_index", raw_array(np.array([-5], "<i4")), r"Rollout.final_index\[0\]: -5; allowed: 0 to inf"),
         ("final_index", raw_array(np.array([5], "<i4")), "1 final_index do not name the 1 truncated steps"),
         ("terminated", raw_array(np.ones((3, 2), bool)), "both terminated and truncated"),
         ("seconds", {"step": math.nan}, r"Rollout.seconds\['step'\]: nan"),
