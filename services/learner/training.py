@@ -73,6 +73,30 @@ class PlayStats:
     mean_return: float
     reward_terms: npt.NDArray[np.float64]  # (8,) mean per frame, reward.TERMS
 
+    @property
+    def catch_rate(self) -> float:
+        """Share of the rallies in which the racket met the ball; as all rates nan where no rally ended."""
+        return _share(self.caught, self.rallies)
+
+    @property
+    def over_rate(self) -> float:
+        """Share of the rallies in which the ball went over the net."""
+        return _share(self.over, self.rallies)
+
+    @property
+    def return_rate(self) -> float:
+        """Share of the rallies in which it landed on the opponent's court."""
+        return _share(self.returned, self.rallies)
+
+    @property
+    def target_error(self) -> float:
+        """Mean distance of what landed to the target [m]; nan where nothing did."""
+        return _share(self.error_sum, self.returned)
+
+
+def _share(part: float, whole: int) -> float:
+    return part / whole if whole else float("nan")
+
 
 @dataclass(frozen=True, slots=True)
 class EpochStats:
@@ -220,10 +244,7 @@ class Training:
         self._follow()
         play = play_stats(rollouts)
         frames = sum(r.rewards.size for r in rollouts)
-        caught, returned = (
-            count / play.rallies if play.rallies else float("nan") for count in (play.caught, play.returned)
-        )
-        running = running_mean(before.catch_rate, caught)
+        running = running_mean(before.catch_rate, play.catch_rate)
         # Without a look at the gate: when it opens, rollouts of this stage are on their way, and are trained on first.
         stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
         due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
@@ -231,7 +252,7 @@ class Training:
         if before.closing == 1:
             stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
-        rate = returned if before.stage == 3 else caught
+        rate = play.return_rate if before.stage == 3 else play.catch_rate
         # While the critic alone learns, the policy can't have gone wrong.
         health = before.health if is_refitting else watched(before.health, rate, self.guard)
         if changed:
