@@ -310,7 +310,7 @@ def test_an_actor_that_runs_out_of_rallies_says_so_once(tmp_path, caplog):
     curriculum = CURRICULUM.model_copy(update={"stage_1": 40, "stage_2": 0, "stage_3": 0})
     with caplog.at_level(logging.INFO), stage(tmp_path, curriculum=curriculum) as s:
         s.learner()
-        s.generator(shards=1, batch=16, rate_hz=2.0)  # enough to begin with, and then next to none
+        s.generator(shards=1, batch=16, rate_hz=0.1)  # enough to begin with, and then none
         actor = s.actor(shards=1)
         wait_until(lambda: "rallies run out" in caplog.text, 60, "the actor to say what it lacks")
         wait_until(
