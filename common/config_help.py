@@ -4,10 +4,10 @@ import inspect
 import json
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import annotated_types
 from pydantic import BaseModel
@@ -119,9 +119,14 @@ def _with_default_of(setting: Setting, owner: Any, path: str) -> Setting:
 
 
 def _allowed(info: FieldInfo) -> str:
+    return _limited(info.annotation, info.metadata)
+
+
+def _limited(kind: Any, rules: Sequence[Any]) -> str:
+    """Return the type in words, and what it may be by the rules it is annotated with."""
     low = high = ""
     extra = []
-    for rule in info.metadata:
+    for rule in rules:
         if isinstance(rule, annotated_types.Gt):
             low = f"above {rule.gt:g}"
         elif isinstance(rule, annotated_types.Ge):
@@ -133,11 +138,13 @@ def _allowed(info: FieldInfo) -> str:
         elif (pattern := getattr(rule, "pattern", None)) is not None:
             extra.append(f"matching {pattern}")
     limits = " ".join(part for part in (low, high) if part)
-    return ", ".join(part for part in (_words(info.annotation), limits, *extra) if part)
+    return ", ".join(part for part in (_words(kind), limits, *extra) if part)
 
 
 def _words(kind: Any) -> str:
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is Annotated:
+        return _limited(arguments[0], arguments[1:])
     if origin is Literal:
         return ", ".join(str(choice) for choice in arguments)
     if origin in (typing.Union, types.UnionType):

@@ -4,15 +4,17 @@
 0   the work was done, or the service was asked to stop
 1   it could not be done: the line on stderr says why
 2   a setting can't be used
-130 asked twice to stop: left at once
+130 told to stop by somebody who insisted (`INSISTS_AFTER_S`): left at once
 ==  ==========================================================================
 """
 
 import logging
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from types import FrameType
 from typing import Final
@@ -38,6 +40,11 @@ STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ReportedError: FAILED,
     TransportError: FAILED,
 }
+
+INSISTS_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 15.0}
+"""How long after the first signal another one leaves at once [s]. A person's second Ctrl-C means it. A second SIGTERM
+may be an echo, which must not cut a last checkpoint short: a service manager tells every process of a group, and
+deploy.local its learner once more when the workers have ended, 12 s later at most."""
 
 _EXIT_WITHIN_S: Final = 10.0
 
@@ -66,16 +73,21 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
 
 
 def stop_on_signals() -> threading.Event:
-    """Return an event that the first SIGINT or SIGTERM sets; the second leaves the process at once."""
+    """Return an event that the first SIGINT or SIGTERM sets; who insists makes the process leave at once."""
     stop = threading.Event()
+    first = math.inf  # [s] when it came
 
     def on_signal(number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
+        nonlocal first
+        now = time.monotonic()
+        if now - first >= INSISTS_AFTER_S[signal.Signals(number)]:
             os._exit(INTERRUPTED)
-        log.info("stopping signal=%s", signal.Signals(number).name)
-        stop.set()
+        if not stop.is_set():
+            first = now
+            log.info("stopping signal=%s", signal.Signals(number).name)
+            stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in INSISTS_AFTER_S:
         signal.signal(number, on_signal)
     return stop
 

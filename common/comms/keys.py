@@ -1,7 +1,8 @@
 """Every key the services use, and how a key expression matches a key.
 
 topspin/v1/<run>/policy                          latest policy: put as a hint, late joiners ask for it
-topspin/v1/<run>/stage                           stage changes: put as a hint, the log is asked for
+topspin/v1/<run>/stage                           stage changes: put as a hint, upon which an actor asks for the
+                                                 policy, which says its stage; all of them for whoever asks
 topspin/v1/<run>/rollout                         rollouts: requests to the learner, the verdict is the reply
 topspin/v1/<run>/rally/<shard>                   valid rallies: put in batches, or asked for by index
 topspin/v1/<run>/ctl/<role>/<id>                 commands to one service; actors' reports to the learner

@@ -23,14 +23,13 @@ U64 = npt.NDArray[np.uint64]
 I32 = npt.NDArray[np.int32]
 
 Count = Annotated[int, Wire("1", low=0, high=2**62)]
-# Of an actor's incarnation. The learner remembers each: a wild one must not cost it its memory.
-Sequence = Annotated[int, Wire("1", low=0, high=4_000_000)]
+# Of an actor's incarnation. Out of reach at any rate (4 a second: 70 million years), and whole as a heartbeat's float.
+Sequence = Annotated[int, Wire("1", low=0, high=2**53)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
 Numbers = Annotated[Mapping[str, float], Wire("by name")]
 
 RALLY_WIDTH = 11  # columns of a rally on the wire
-UNVALIDATED = 1  # bit of Rollout.rally_flags: a random launch that nobody has checked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +69,7 @@ newest weights."""
 class PolicySnapshot:
     """All that an actor needs to play one version of the policy, in one blob."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     run: str
     generation: Count
@@ -84,9 +83,6 @@ class PolicySnapshot:
     obs_mean: Annotated[F64, Wire("as the observation", "<f8", "D")]
     obs_var: Annotated[F64, Wire("its square", "<f8", "D", low=0)]
     obs_count: Count
-    value_mean: Annotated[float, Wire("reward")]
-    value_var: Annotated[float, Wire("reward^2", low=0)]
-    value_count: Count = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,23 +118,22 @@ class StageLog:
 class Episodes:
     """Summaries of the E episodes that ended in a rollout."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     outcome: Annotated[U8, Wire("index of the outcome", "|u1", "E")]
     target_error: Annotated[F32, Wire("m", "<f4", "E", low=0, nan=True)]  # NaN: the ball did not land
     caught: Annotated[Bool, Wire("", "|b1", "E")]
     over: Annotated[Bool, Wire("", "|b1", "E")]
     landed: Annotated[Bool, Wire("", "|b1", "E")]
-    unvalidated: Annotated[Bool, Wire("", "|b1", "E")]  # left out of all rates
+    unvalidated: Annotated[Bool, Wire("", "|b1", "E")]  # launches that nobody has checked: in no rate
     returns: Annotated[F32, Wire("reward", "<f4", "E")]
-    length: Annotated[I32, Wire("control steps", "<i4", "E", low=1)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rollout:
     """One contiguous block of T control steps in B environments, as it was played."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     run: str
     generation: Count
@@ -151,14 +146,12 @@ class Rollout:
     obs: Annotated[F32, Wire("as the observation", "<f4", "T B D")]  # raw: the learner normalises
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
     log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log-density of the action under the policy that acted
-    values: Annotated[F32, Wire("reward", "<f4", "T B")]
     rewards: Annotated[F32, Wire("reward", "<f4", "T B")]
     terminated: Annotated[Bool, Wire("", "|b1", "T B")]
     truncated: Annotated[Bool, Wire("", "|b1", "T B")]
     final_obs: Annotated[F32, Wire("as the observation", "<f4", "K D")]  # the last real one of each truncated
     final_index: Annotated[I32, Wire("t * B + b", "<i4", "K", low=0)]  # the step it followed, increasing
     last_obs: Annotated[F32, Wire("as the observation", "<f4", "B D")]  # after step T: bootstrap at the cut
-    rally_flags: Annotated[U8, Wire("bits", "|u1", "T B", low=0, high=UNVALIDATED)]
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
     # What the actions before a hit should have differed by (hindsight.correction); rows of zeros: nothing is known

@@ -6,10 +6,11 @@ critic; Pinto et al. 2018, "Asymmetric actor critic for image-based robot learni
 
 import math
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+from annotated_types import Ge
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
@@ -25,7 +26,7 @@ class NetworkConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    units: tuple[int, ...] = Field(
+    units: tuple[Annotated[int, Ge(1)], ...] = Field(
         (256, 128, 128, 64, 64, 32), min_length=1, description="widths of the D2RL trunk's hidden layers"
     )
     trunks: Literal["shared", "separate"] = Field(

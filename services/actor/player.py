@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from common.comms.messages import UNVALIDATED, Episodes, PolicySnapshot, Rollout
+from common.comms.messages import Episodes, PolicySnapshot, Rollout
 from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
 from common.env.review import Lessons
 from common.policy.actor_critic import NetworkConfig, log_prob
@@ -52,8 +52,8 @@ class Player:
         self.contract_hash = task_hash(network, config.model_dump(mode="json"), launch)
         self.snapshot: PolicySnapshot | None = None
         self._obs_size = size(critic_layout(config.observation))
-        self._network = new_network(network, config.observation)
-        self._moments = Moments.initial(self._obs_size)
+        self._network = new_network(network, config.observation)  # of which the policy alone is asked
+        self._moments = Moments.initial(self._network.obs_size)
         self._noise = torch.Generator()
         self._seed = seed
         self._clock = clock
@@ -74,7 +74,8 @@ class Player:
             critic_layout(self.env.config.observation),
         )
         unpack(self._network, snapshot.weights)
-        self._moments = moments
+        seen = self._network.obs_size
+        self._moments = Moments(moments.mean[:seen], moments.var[:seen], moments.count)
         if self.snapshot is None or self.snapshot.stage != snapshot.stage:
             self.env.set_stage(snapshot.stage)
         self.snapshot = snapshot
@@ -93,30 +94,24 @@ class Player:
             self._obs = self.env.reset()
         obs = np.empty((steps, envs, self._obs_size), np.float32)
         actions = np.empty((steps, envs, ACTION_SIZE), np.float32)
-        log_mu, values, rewards = (np.empty((steps, envs), np.float32) for _ in range(3))
+        log_mu, rewards = (np.empty((steps, envs), np.float32) for _ in range(2))
         terminated, truncated = np.empty((steps, envs), np.bool_), np.empty((steps, envs), np.bool_)
-        flags = np.empty((steps, envs), np.uint8)
         final_obs: list[Floats] = []
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
-        value_scale, value_mean = (
-            np.float32(np.sqrt(snapshot.value_var + 1e-5)),
-            np.float32(snapshot.value_mean),
-        )
+        seen = self._network.obs_size
         for t in range(steps):
             started = self._clock()
             obs[t] = self._obs
             with torch.inference_mode():
-                mean, value = self._network(torch.from_numpy(normalize(self._obs, self._moments)))
+                mean = self._network.act(torch.from_numpy(normalize(self._obs[:, :seen], self._moments)))
                 noise = torch.randn(mean.shape, generator=self._noise)
                 action = mean + self._network.log_sigma.exp() * noise
                 log_mu[t] = log_prob(action, mean, self._network.log_sigma).numpy()
             actions[t] = action.numpy()
-            values[t] = value.numpy() * value_scale + value_mean
-            flags[t] = np.where(self.env.validated, 0, UNVALIDATED)
             acted = self._clock()
             step = self.env.step(actions[t])
             self._obs = step.obs
@@ -142,14 +137,12 @@ class Player:
             obs=obs,
             actions=actions,
             log_mu=log_mu,
-            values=values,
             rewards=rewards,
             terminated=terminated,
             truncated=truncated,
             final_obs=np.concatenate(final_obs) if final_obs else np.zeros((0, self._obs_size), np.float32),
             final_index=np.concatenate(final_index) if final_index else np.zeros(0, np.int32),
             last_obs=self._obs.copy(),
-            rally_flags=flags,
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
             corrections=np.where(np.abs(actions) < 1.0, corrections, 0.0),
@@ -185,5 +178,4 @@ def _episodes(finished: list[FinishedRallies]) -> Episodes:
         landed=outcome == Outcome.RETURNED,
         unvalidated=~column("validated", np.bool_).astype(np.bool_),
         returns=column("returns", np.float32).astype(np.float32),
-        length=column("lengths", np.int32).astype(np.int32),
     )

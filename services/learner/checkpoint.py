@@ -25,7 +25,7 @@ from services.learner.training import Progress, Training
 FORMAT = 1
 SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
-GOOD = "good"  # folder beside them: the last one from which training went well
+GOOD = "good"  # folder beside them: the last one that is worth going back to
 
 _NETWORK, _AVERAGE, _ADAM = "network.", "average.", "adam."
 _MOMENTS = ("obs_moments", "value_moments")

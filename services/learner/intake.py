@@ -13,9 +13,9 @@ short episodes. An actor without credits reports until it gets some: no grant ca
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
 from services.learner.ledger import Account, Fate, Ledger, Outcome, Remembered, restored
@@ -37,7 +37,9 @@ class IntakeConfig(BaseModel):
         2, ge=0, le=64, description="versions that a rollout may be behind; 0 is strictly synchronous"
     )
     target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
-    queue_rollouts: int = Field(256, ge=1, description="rollouts that may wait; bounds the memory")
+    queue_rollouts: int = Field(
+        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
+    )
     window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
     credit_patience_s: float = Field(
         30.0,
@@ -45,6 +47,14 @@ class IntakeConfig(BaseModel):
         description="silence after which an actor's unused credits go to others",
         json_schema_extra={"unit": "s"},
     )
+
+    @model_validator(mode="after")
+    def _a_dataset_fits_into_the_queue(self) -> Self:
+        if self.dataset_rollouts > self.queue_rollouts:
+            raise ValueError(
+                f"dataset_rollouts {self.dataset_rollouts}; allowed: up to queue_rollouts, {self.queue_rollouts}"
+            )
+        return self
 
     @property
     def lag_aimed_at(self) -> int:
@@ -120,17 +130,26 @@ class Intake:
         return self._verdict(VerdictKind.UNREADABLE, VerdictKind.UNREADABLE, reason)
 
     def report(self, report: ActorReport, now: float) -> Verdict:
-        """Return fresh credits for an actor, which is alive if it says so, whatever was thought."""
+        """Return fresh credits for an actor, which is alive if it says so, unless its token has gone since.
+
+        News of a death overtakes what the dead said last. Whoever was only cut off is seen again, and then heard.
+        """
         account = self._heard(report.actor, report.incarnation, now)
         account.hear(report, self._standing.generation)
-        account.is_alive = not report.leaving
+        account.is_alive = not (report.leaving or account.is_out_of_sight)
         self._grant(account, now)
         return self._verdict(VerdictKind.CREDITS, VerdictKind.CREDITS, "", account.credit_limit)
 
     def gone(self, actor: str, incarnation: int) -> None:
         """Note that an actor died or left: what it had under way is lost, its credits are free."""
         account = self._accounts.setdefault((actor, incarnation), Account(actor, incarnation))
-        account.is_alive = False
+        account.is_alive, account.is_out_of_sight = False, True
+
+    def seen(self, actor: str, incarnation: int) -> None:
+        """Note that an actor's token is in sight: one that had gone is back, and what it has under way may come."""
+        account = self._accounts.get((actor, incarnation))
+        if account is not None and account.is_out_of_sight:
+            account.is_alive, account.is_out_of_sight = True, False
 
     def take_dataset(self) -> tuple[Queued, ...]:
         """Return the rollouts of the next dataset, oldest first, and start its update; () while too few wait.
@@ -160,12 +179,6 @@ class Intake:
                 self._queue.append(entry)
             else:
                 self._settle(entry, Fate.LOST)
-
-    def abandon_update(self) -> None:
-        """Write the dataset down as lost: its update failed or was interrupted."""
-        for entry in self._in_update:
-            self._settle(entry, Fate.LOST)
-        self._in_update = ()
 
     def ledgers(self) -> dict[tuple[str, int], Ledger]:
         """Return the account of every (actor, incarnation)."""

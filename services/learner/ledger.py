@@ -10,10 +10,9 @@ repeated. What then remains missing is in flight, or lost once the actor is dead
 
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -88,29 +87,24 @@ class Remembered:
         return cls(values["actor"], values["incarnation"], values["published"], outcomes)
 
 
-RECENT = 1024
-"""Rollouts behind the highest whose outcomes are kept one by one; older ones fold into spans: an actor that works for
-days has millions."""
-
-
 class Account:
-    """What the learner knows about one incarnation of one actor."""
+    """What the learner knows about one incarnation of one actor.
+
+    An actor that works for months numbers hundreds of millions, nearly all of which end alike: what became of them is
+    kept as ranges, so that memory hangs on how often outcomes change, not on how many there are nor on how high a
+    number somebody claims.
+    """
 
     def __init__(self, actor: str, incarnation: int) -> None:
         self.actor = actor
         self.incarnation = incarnation
         self.is_alive = True  # nothing that is missing will come from the dead
+        self.is_out_of_sight = False  # its liveliness token went: what it says was said before
         self.last_heard = 0.0  # [s] on the caller's clock
         self.credit_limit = 0
-        self._outcomes: dict[int, Outcome] = {}  # from ``_folded`` on
-        self._spans: list[
-            tuple[int, int, Outcome]
-        ] = []  # half-open, of all numbers below ``_folded``, in order
-        self._folded = 0
+        self._known: list[tuple[int, int, Outcome]] = []  # half-open ranges in order, as long as they can be
         self._counts: Counter[Outcome] = Counter()
-        self._missing: set[int] = set()  # published, and no outcome known
         self._published = 0
-        self._highest = -1
 
     @property
     def published(self) -> int:
@@ -120,87 +114,95 @@ class Account:
     @property
     def missing(self) -> int:
         """How many of them we know nothing else about: under way to us, as long as the actor lives."""
-        return len(self._missing)
+        return self._published - self._counts.total()
 
     @property
     def gaps(self) -> int:
         """How many numbers are missing below the highest that came; with a window of 2, one may yet come."""
-        return sum(sequence < self._highest for sequence in self._missing)
+        return (self._known[-1][1] if self._known else 0) - self._counts.total()
+
+    @property
+    def ranges(self) -> int:
+        """How many ranges of like outcomes there are: what this account takes of the memory."""
+        return len(self._known)
 
     def outcome(self, sequence: int) -> Outcome | None:
         """Return what became of a rollout, or None."""
-        if sequence < self._folded:
-            return self._spans[bisect_right(self._spans, sequence, key=lambda span: span[0]) - 1][2]
-        return self._outcomes.get(sequence)
+        at = self._at(sequence) - 1
+        return self._known[at][2] if at >= 0 and sequence < self._known[at][1] else None
 
     def settle(self, sequence: int, outcome: Outcome) -> None:
-        """Write down what became of a rollout; of one that is long final, no more."""
-        if sequence < self._folded:
-            return
-        self._publish_up_to(sequence + 1)
-        self._missing.discard(sequence)
-        if (before := self._outcomes.get(sequence)) is not None:
-            self._counts[before] -= 1
-        self._outcomes[sequence] = outcome
-        self._counts[outcome] += 1
-        self._highest = max(self._highest, sequence)
-        self._fold()
+        """Write down what became of a rollout; what is final stands."""
+        if self.outcome(sequence) in (None, Fate.QUEUED):
+            self._write(sequence, sequence + 1, outcome)
 
     def hear(self, report: ActorReport, generation: int) -> None:
         """Take over what the actor knows and the learner of ``generation`` may not."""
-        self._publish_up_to(report.published)
+        self._published = max(self._published, report.published)
         elsewhere: dict[int, Outcome] = {refusal.sequence: refusal.kind for refusal in report.refused}
         elsewhere.update(dict.fromkeys(report.dropped, Fate.DROPPED))
+        for sequence, outcome in elsewhere.items():
+            if sequence < self._published and self.outcome(sequence) is None:
+                self._write(sequence, sequence + 1, outcome)
         if report.generation == generation:
             # what it doesn't list was accepted, and not by us; before it has heard us, it can't tell yet
-            listed = elsewhere.keys() | set(report.in_flight)
-            accepted = [s for s in self._missing if s < report.published and s not in listed]
-            elsewhere.update(dict.fromkeys(accepted, Fate.LOST))
-        for sequence in elsewhere.keys() & self._missing:
-            self.settle(sequence, elsewhere[sequence])
+            for first, end in self._missing_below(report.published, set(report.in_flight)):
+                self._write(first, end, Fate.LOST)
 
     def ledger(self) -> Ledger:
         """Return the account."""
-        missing = len(self._missing)
         refused = {kind: self._counts[kind] for kind in VerdictKind if self._counts[kind]}
         return Ledger(
             published=self._published,
             trained=self._counts[Fate.TRAINED],
             refused=MappingProxyType(refused),
             dropped=self._counts[Fate.DROPPED],
-            in_flight=self._counts[Fate.QUEUED] + (missing if self.is_alive else 0),
-            lost=self._counts[Fate.LOST] + (0 if self.is_alive else missing),
+            in_flight=self._counts[Fate.QUEUED] + (self.missing if self.is_alive else 0),
+            lost=self._counts[Fate.LOST] + (0 if self.is_alive else self.missing),
         )
 
     def remember(self) -> Remembered:
         """Return what a checkpoint keeps."""
         ranges: dict[str, list[Span]] = {}
-        recent = ((sequence, sequence + 1, outcome) for sequence, outcome in sorted(self._outcomes.items()))
-        for first, end, outcome in chain(self._spans, recent):
-            of_one = ranges.setdefault(outcome.value, [])
-            if of_one and of_one[-1][1] == first:
-                of_one[-1] = (of_one[-1][0], end)
-            else:
-                of_one.append((first, end))
+        for first, end, outcome in self._known:
+            ranges.setdefault(outcome.value, []).append((first, end))
         outcomes = tuple((name, tuple(of_one)) for name, of_one in sorted(ranges.items()))
         return Remembered(self.actor, self.incarnation, self._published, outcomes)
 
-    def _fold(self) -> None:
-        """Fold what is final and long ago."""
-        while self._folded < self._highest - RECENT:
-            outcome = self._outcomes.get(self._folded)
-            if outcome is None or outcome is Fate.QUEUED:
-                return
-            del self._outcomes[self._folded]
-            if self._spans and self._spans[-1][2] == outcome:
-                self._spans[-1] = (self._spans[-1][0], self._folded + 1, outcome)
-            else:
-                self._spans.append((self._folded, self._folded + 1, outcome))
-            self._folded += 1
+    def _at(self, sequence: int) -> int:
+        """Return how many ranges begin at ``sequence`` or before."""
+        return bisect_right(self._known, sequence, key=lambda known: known[0])
 
-    def _publish_up_to(self, published: int) -> None:
-        self._missing.update(range(self._published, published))
-        self._published = max(self._published, published)
+    def _write(self, first: int, end: int, outcome: Outcome) -> None:
+        """Write down the outcome of a range of which nothing is known, or one and the same thing."""
+        if (before := self.outcome(first)) is not None:
+            self._counts[before] -= end - first
+        self._counts[outcome] += end - first
+        self._published = max(self._published, end)
+        at = self._at(first)
+        near = slice(max(at - 2, 0), at + 1)  # what the new range may cut, or join
+        pieces = [(first, end, outcome)]
+        for start, stop, known in self._known[near]:
+            pieces += [(start, min(stop, first), known), (max(start, end), stop, known)]
+        joined: list[tuple[int, int, Outcome]] = []
+        for piece in sorted(piece for piece in pieces if piece[0] < piece[1]):
+            if joined and joined[-1][1:] == (piece[0], piece[2]):
+                joined[-1] = (joined[-1][0], *piece[1:])
+            else:
+                joined.append(piece)
+        self._known[near] = joined
+
+    def _missing_below(self, end: int, listed: Set[int]) -> list[Span]:
+        """Return the ranges below ``end`` of which nothing is known, without the numbers that are ``listed``."""
+        if not self.missing:
+            return []
+        taken = sorted([(first, stop) for first, stop, _ in self._known] + [(n, n + 1) for n in listed])
+        found, start = [], 0
+        for first, stop in [*taken, (end, end)]:
+            if start < min(first, end):
+                found.append((start, min(first, end)))
+            start = max(start, stop)
+        return found
 
 
 def restored(memory: Remembered) -> Account:
@@ -210,7 +212,6 @@ def restored(memory: Remembered) -> Account:
     in_order = sorted((first, end, name) for name, ranges in memory.outcomes for first, end in ranges)
     for first, end, name in in_order:
         outcome: Outcome = Fate(name) if name in FATES else VerdictKind(name)
-        for sequence in range(first, end):
-            account.settle(sequence, Fate.LOST if outcome is Fate.QUEUED else outcome)
-    account._publish_up_to(memory.published)
+        account._write(first, end, Fate.LOST if outcome is Fate.QUEUED else outcome)
+    account._published = max(account._published, memory.published)
     return account

@@ -12,12 +12,12 @@ At lag 0 pi_prox = mu, w = 1: plain PPO.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
@@ -69,6 +69,15 @@ class PPOConfig(BaseModel):
     refit_variance: float = Field(
         0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
     )
+
+    @model_validator(mode="after")
+    def _bounds_are_in_order(self) -> Self:  # what the rate starts from is brought within them as it adapts
+        if self.learning_rate_min > self.learning_rate_max:
+            raise ValueError(
+                f"learning_rate_min {self.learning_rate_min:g}; "
+                f"allowed: up to learning_rate_max, {self.learning_rate_max:g}"
+            )
+        return self
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ if TYPE_CHECKING:
 
 
 def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, float]:
-    """Return what is recorded of an epoch, by column; rates are of rallies with exploration noise."""
+    """Return what is recorded of an epoch, by column; rates are of rallies with exploration noise, nan without any."""
     play, update, progress = stats.play, stats.update, stats.progress
-    rallies = max(play.rallies, 1)
     result = {
         "epoch": progress.epoch,
         "frames": progress.frames,
@@ -26,10 +25,10 @@ def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, flo
         "lag": stats.lag,
         "rallies": play.rallies,
         "unvalidated": play.unvalidated,
-        "catch_rate": play.caught / rallies,
-        "over_rate": play.over / rallies,
-        "return_rate": play.returned / rallies,
-        "target_error": play.error_sum / play.returned if play.returned else float("nan"),
+        "catch_rate": play.catch_rate,
+        "over_rate": play.over_rate,
+        "return_rate": play.return_rate,
+        "target_error": play.target_error,
         "episode_return": play.mean_return,
         "policy_loss": update.policy_loss,
         "value_loss": update.value_loss,

@@ -220,7 +220,7 @@ class LearnerService:
             trained_seconds=self.seconds,
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
-        if self.training.progress.health.is_good:
+        if self.training.progress.is_worth_going_back_to:
             checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
         save_policy(
             self._folder.latest_policy, self.training.average, self.training.obs_moments, self._contract()
@@ -341,9 +341,6 @@ class LearnerService:
                 obs_mean=training.obs_moments.mean,
                 obs_var=training.obs_moments.var,
                 obs_count=training.obs_moments.count,
-                value_mean=float(training.value_moments.mean),
-                value_var=float(training.value_moments.var),
-                value_count=training.value_moments.count,
             )
         )
 
@@ -370,8 +367,8 @@ class LearnerService:
             (self._alive.add if event.alive else self._alive.discard)(
                 (member.role, member.id, member.incarnation)
             )
-            if member.role == "actor" and not event.alive:
-                self._intake.gone(member.id, member.incarnation)
+            if member.role == "actor":
+                (self._intake.seen if event.alive else self._intake.gone)(member.id, member.incarnation)
         for _ in range(SERVED_AT_ONCE):
             request = self._rollouts.poll()
             if request is None:
@@ -451,7 +448,6 @@ class LearnerService:
 
     def _measure(self, stats: EpochStats, rate: float, update_s: float) -> None:
         m, play, update, progress = self._metrics, stats.play, stats.update, stats.progress
-        rallies = max(play.rallies, 1)
         m.inc("topspin_frames_total", stats.frames)
         m.inc("topspin_episodes_total", int(play.outcomes.sum()))
         m.inc("topspin_phase_seconds_total", update_s, phase="update")
@@ -461,10 +457,10 @@ class LearnerService:
                 m.inc("topspin_outcomes_total", int(play.outcomes[outcome]), outcome=outcome.name.lower())
         for name, value in {
             "topspin_frames_per_second": rate,
-            "topspin_catch_rate": play.caught / rallies,
-            "topspin_over_rate": play.over / rallies,
-            "topspin_return_rate": play.returned / rallies,
-            "topspin_target_error_meters": play.error_sum / play.returned if play.returned else float("nan"),
+            "topspin_catch_rate": play.catch_rate,
+            "topspin_over_rate": play.over_rate,
+            "topspin_return_rate": play.return_rate,
+            "topspin_target_error_meters": play.target_error,
             "topspin_episode_reward": play.mean_return,
             "topspin_policy_version": progress.version,
             "topspin_policy_lag": stats.lag,
@@ -483,9 +479,9 @@ class LearnerService:
             m.set(name, value)
         self._last = {
             "frames_per_s": rate,
-            "catch_rate": play.caught / rallies,
-            "return_rate": play.returned / rallies,
-            "target_error": play.error_sum / play.returned if play.returned else float("nan"),
+            "catch_rate": play.catch_rate,
+            "return_rate": play.return_rate,
+            "target_error": play.target_error,
             "reward": play.mean_return,
             "lag": stats.lag,
             "kl": update.kl,

@@ -48,6 +48,15 @@ class Progress:
     health: Health = field(default_factory=Health)
     rollbacks: int = 0  # times that training went back to a good checkpoint
     closing: int = 0  # datasets that the stage still takes once its gate has opened; 0: it hasn't
+    refitting_since: int = 0  # epoch of the stage in which the critic began to
+
+    @property
+    def is_worth_going_back_to(self) -> bool:
+        """Whether a checkpoint of now may be the one to go back to.
+
+        A stage begins with one: until its measure speaks, the last good one is of the stage before.
+        """
+        return self.health.is_good or (self.stage_number > 0 and self.epochs_in_stage == 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +72,30 @@ class PlayStats:
     unvalidated: int
     mean_return: float
     reward_terms: npt.NDArray[np.float64]  # (8,) mean per frame, reward.TERMS
+
+    @property
+    def catch_rate(self) -> float:
+        """Share of the rallies in which the racket met the ball; as all rates nan where no rally ended."""
+        return _share(self.caught, self.rallies)
+
+    @property
+    def over_rate(self) -> float:
+        """Share of the rallies in which the ball went over the net."""
+        return _share(self.over, self.rallies)
+
+    @property
+    def return_rate(self) -> float:
+        """Share of the rallies in which it landed on the opponent's court."""
+        return _share(self.returned, self.rallies)
+
+    @property
+    def target_error(self) -> float:
+        """Mean distance of what landed to the target [m]; nan where nothing did."""
+        return _share(self.error_sum, self.returned)
+
+
+def _share(part: float, whole: int) -> float:
+    return part / whole if whole else float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +214,9 @@ class Training:
             self.curriculum,
         )
         # A value that explains the new rewards is what the policy waits for after a stage change.
+        refitted = before.epochs_in_stage - before.refitting_since
         is_refitting = before.refitting and (
-            before.epochs_in_stage < self.ppo.refit_epochs and explained < self.ppo.refit_variance
+            refitted < self.ppo.refit_epochs and explained < self.ppo.refit_variance
         )
         stats = update(
             self.network,
@@ -210,10 +244,7 @@ class Training:
         self._follow()
         play = play_stats(rollouts)
         frames = sum(r.rewards.size for r in rollouts)
-        caught, returned = (
-            count / play.rallies if play.rallies else float("nan") for count in (play.caught, play.returned)
-        )
-        running = running_mean(before.catch_rate, caught)
+        running = running_mean(before.catch_rate, play.catch_rate)
         # Without a look at the gate: when it opens, rollouts of this stage are on their way, and are trained on first.
         stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
         due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
@@ -221,13 +252,11 @@ class Training:
         if before.closing == 1:
             stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
-        rate = returned if before.stage == 3 else caught
+        rate = play.return_rate if before.stage == 3 else play.catch_rate
         # While the critic alone learns, the policy can't have gone wrong.
         health = before.health if is_refitting else watched(before.health, rate, self.guard)
         if changed:
-            self.obs_moments = self.obs_moments.recounted()
-            if stage == 3:
-                self._calm(self.curriculum.aiming_log_sigma)
+            self._enter(stage)
         self.progress = Progress(
             version=before.version + 1,
             epoch=before.epoch + 1,
@@ -241,6 +270,7 @@ class Training:
             health=Health() if changed else health,
             rollbacks=before.rollbacks,
             closing=0 if changed else closing,
+            refitting_since=0 if changed else before.refitting_since,
         )
         lag = float(np.mean([before.version - r.version for r in rollouts]))
         diverged = divergence(health, self.is_finite, self.guard)
@@ -252,6 +282,12 @@ class Training:
         weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
         for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(newest, weight)
+
+    def _enter(self, stage: int) -> None:
+        """Make a stage change's changes to what has been learned."""
+        self.obs_moments = self.obs_moments.recounted()
+        if stage == 3:
+            self._calm(self.curriculum.aiming_log_sigma)
 
     @torch.no_grad()
     def _calm(self, log_sigma: float) -> None:
@@ -266,16 +302,27 @@ class Training:
     def go_back(self, load: Callable[["Training"], object]) -> None:
         """Take network, optimiser and moments from an earlier moment of this run; time doesn't go back.
 
-        Versions, frames and epochs go on, since actors hold this life's policies. The learning rate starts anew at
-        half of what led here: the same steps on other data might lead here again.
+        Versions, frames, epochs and the stage go on, since actors hold this life's policies; where the earlier moment
+        was of another stage, the change is made again, and a critic that knew other rewards than the stage's learns
+        them first. The learning rate starts anew at half of what led here: the same steps on other data might lead
+        here again.
 
         Args:
             load: Restores the earlier moment into the training it is given.
         """
         now = self.progress
         load(self)
-        rate = max(0.5 * now.learning_rate, self.ppo.learning_rate_min)
-        self.progress = replace(now, learning_rate=rate, rollbacks=now.rollbacks + 1, health=Health())
+        then = self.progress
+        if is_other_stage := then.stage_number != now.stage_number:
+            self._enter(now.stage)
+        self.progress = replace(
+            now,
+            learning_rate=max(0.5 * now.learning_rate, self.ppo.learning_rate_min),
+            rollbacks=now.rollbacks + 1,
+            health=Health(),
+            refitting=is_other_stage or then.refitting,
+            refitting_since=now.epochs_in_stage,
+        )
 
     def _dataset(self, rollouts: Sequence[Rollout]) -> tuple[Dataset, float]:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""

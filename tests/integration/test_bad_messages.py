@@ -204,14 +204,12 @@ BLOCK = (  # the fields of a rollout whose size is that of its block
     "obs",
     "actions",
     "log_mu",
-    "values",
     "rewards",
     "terminated",
     "truncated",
     "final_obs",
     "final_index",
     "last_obs",
-    "rally_flags",
     "corrections",
 )
 

@@ -291,6 +291,18 @@ def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it
     assert bool(weights.isfinite().all())
 
 
+def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
+    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        begun = LONG.stage_1 + LONG.stage_2
+        wait_until(lambda: progress(learner).epoch > begun, 60, "stage 3")
+        kept = [path.stem for path in checkpoints(tmp_path / "checkpoints" / "good")]
+
+    assert kept == [f"{begun:08d}"]
+
+
 def test_a_run_that_diverges_with_nothing_to_go_back_to_ends_with_one_line(tmp_path):
     with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
         learner = s.learner()
@@ -313,7 +325,7 @@ def test_an_actor_that_runs_out_of_rallies_says_so_once(tmp_path, caplog):
     curriculum = CURRICULUM.model_copy(update={"stage_1": 40, "stage_2": 0, "stage_3": 0})
     with caplog.at_level(logging.INFO), stage(tmp_path, curriculum=curriculum) as s:
         s.learner()
-        s.generator(shards=1, batch=16, rate_hz=2.0)  # enough to begin with, and then next to none
+        s.generator(shards=1, batch=16, rate_hz=0.1)  # enough to begin with, and then none
         actor = s.actor(shards=1)
         wait_until(lambda: "rallies run out" in caplog.text, 60, "the actor to say what it lacks")
         wait_until(

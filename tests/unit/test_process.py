@@ -83,22 +83,33 @@ def run_python(program: str, *, until: str) -> subprocess.Popen[str]:
     return process
 
 
-def test_a_second_signal_leaves_at_once():
-    program = """
-import os, signal, time
-from common.process import run_service
+@pytest.mark.parametrize("first", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize(
+    ("then", "patience_s", "status"),
+    [
+        (["SIGINT"], 60.0, 130),  # a person insists
+        (["SIGTERM"], 0.0, 130),  # told again, and long enough ago
+        (["SIGTERM"] * 3, 60.0, 7),  # a service manager told the whole group, then deploy.local its own
+    ],
+)
+def test_who_is_told_again_to_stop_leaves_at_once_unless_it_is_an_echo_of_the_first(
+    first, then, patience_s, status
+):
+    program = f"""
+import os, signal, sys
+import common.process
+common.process.INSISTS_AFTER_S[signal.SIGTERM] = {patience_s}
 def main(stop):
-    os.kill(os.getpid(), signal.SIGTERM)
+    os.kill(os.getpid(), signal.{first})
     stop.wait(5.0)
     print("asked", flush=True)
-    while True:
-        time.sleep(60.0)
-run_service("learner", main)
+    for name in {then}:
+        os.kill(os.getpid(), getattr(signal, name))
+    return 7  # all that was to be done has been done
+sys.exit(common.process.run_service("learner", main))
 """
     with run_python(program, until="asked\n") as process:
-        process.send_signal(signal.SIGTERM)
-
-        assert process.wait(timeout=10) == 130
+        assert process.wait(timeout=10) == status
 
 
 def test_a_thread_that_nobody_stopped_does_not_keep_the_process():

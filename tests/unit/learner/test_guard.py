@@ -5,12 +5,13 @@ import pytest
 import torch
 
 from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import normalize
 from services.learner import checkpoint
 from services.learner.checkpoint import Extras, keep, restore, save
 from services.learner.curriculum import CurriculumConfig
 from services.learner.guard import GuardConfig, Health, divergence, watched
 from services.learner.ppo import PPOConfig
-from services.learner.training import Training
+from services.learner.training import Progress, Training
 from tests.unit.learner.rollouts import make_rollout
 
 GUARD = GuardConfig(collapse=0.5, least=0.2, patience=5)
@@ -24,11 +25,11 @@ def history(rates, config=GUARD):
     return health
 
 
-def make_training(guard=GUARD):
+def make_training(guard=GUARD, curriculum=CurriculumConfig(stage_1=50), **ppo):
     return Training(
-        PPOConfig(minibatch=64, mini_epochs=2),
+        PPOConfig(**{"minibatch": 64, "mini_epochs": 2, **ppo}),
         NetworkConfig(units=(16, 8)),
-        CurriculumConfig(stage_1=50),
+        curriculum,
         np.zeros(7, np.float32),
         0,
         guard=guard,
@@ -86,6 +87,90 @@ def test_going_back_takes_the_learned_and_leaves_the_time(tmp_path):
     assert (after.version, after.epoch, after.frames) == (before.version, before.epoch, before.frames)
     assert after.rollbacks == 1
     assert after.learning_rate <= max(0.5 * before.learning_rate, training.ppo.learning_rate_min)
+
+
+STAGES = CurriculumConfig(stage_1=2, stage_2=2, stage_3=50)
+HELD = {"refit_epochs": 3, "refit_variance": 1.0, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
+
+
+def played_by(training):
+    """Return mean actions for observations as they come, away from the normaliser's clip."""
+    raw = 0.3 * make_rollout(77).obs.reshape(-1, 37)
+    with torch.no_grad():
+        return training.network(torch.from_numpy(normalize(raw, training.obs_moments)))[0]
+
+
+def test_a_stage_that_has_no_measure_yet_goes_back_to_its_beginning():
+    training = make_training(curriculum=STAGES)
+    worth = {}
+    for seed in range(6):
+        progress = training.run_epoch([make_rollout(seed, terminated=np.zeros((16, 8), bool))]).progress
+        worth[progress.stage, progress.epochs_in_stage] = progress.is_worth_going_back_to
+
+    assert worth[2, 0]
+    assert worth[3, 0]
+    assert not worth[3, 1]  # its critic alone has learned
+    assert not Progress().is_worth_going_back_to
+
+
+@pytest.mark.parametrize("epochs", [1, 2, 4])
+def test_going_back_over_a_stage_change_makes_the_change_again(tmp_path, epochs):
+    """Whether at the change itself, in stage 2, or two stages later."""
+    training = make_training(curriculum=STAGES)
+    training.run_epoch([make_rollout(1)])
+    good = save(tmp_path, training, EXTRAS)
+    for seed in range(epochs):
+        training.run_epoch([make_rollout(2 + seed)])
+    before = training.progress
+    assert before.stage > 1
+
+    training.go_back(lambda t: restore(good, t))
+
+    after = training.progress
+    assert (after.stage, after.stage_number) == (before.stage, before.stage_number)
+    assert after.refitting
+    assert training.obs_moments.count == 1
+    for network in (training.network, training.average):
+        assert bool((network.log_sigma <= STAGES.aiming_log_sigma).all()) == (after.stage == 3)
+
+
+@pytest.mark.parametrize("at_its_change", [False, True])
+def test_a_critic_that_goes_back_to_the_old_rewards_learns_the_new_ones_first(tmp_path, at_its_change):
+    training = make_training(curriculum=STAGES, **HELD)
+    training.run_epoch([make_rollout(1)])
+    if at_its_change:
+        training.run_epoch([make_rollout(2)])
+        assert training.progress.refitting
+    good = save(tmp_path, training, EXTRAS)
+    for seed in range(3, 12):
+        training.run_epoch([make_rollout(seed)])
+    assert (training.progress.stage, training.progress.refitting) == (3, False)
+
+    training.go_back(lambda t: restore(good, t))
+
+    start = played_by(training)
+    for seed in range(20, 23):
+        training.run_epoch([make_rollout(seed)])
+    assert (
+        float((played_by(training) - start).square().mean()) < 1e-9
+    )  # rounding: the normaliser moves under it
+    for seed in range(23, 26):
+        training.run_epoch([make_rollout(seed)])
+    assert float((played_by(training) - start).square().mean()) > 1e-6
+
+
+def test_going_back_within_a_stage_leaves_its_critic_and_normaliser_as_they_were(tmp_path):
+    training = make_training(curriculum=STAGES, refit_epochs=1)
+    for seed in range(8):
+        training.run_epoch([make_rollout(seed)])
+    assert not training.progress.refitting
+    good, moments = save(tmp_path, training, EXTRAS), training.obs_moments
+    training.run_epoch([make_rollout(9)])
+
+    training.go_back(lambda t: restore(good, t))
+
+    assert training.obs_moments.count == moments.count
+    assert not training.progress.refitting
 
 
 def test_weights_that_blow_up_are_told_with_the_epoch():

@@ -1,15 +1,18 @@
+import csv
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import torch
 
+from common.comms.messages import Episodes
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments, normalize
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
 from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
+from services.learner.record import Record, row
 from services.learner.training import Training, play_stats
 from tests.unit.learner.rollouts import make_rollout
 
@@ -188,8 +191,32 @@ def test_balls_that_no_generator_validated_are_in_no_rate():
     assert (stats.rallies, stats.unvalidated) == (8, 2)
     assert (stats.caught, stats.over, stats.returned) == (4, 2, 2)
     assert stats.error_sum == pytest.approx(0.4)
+    assert (stats.catch_rate, stats.over_rate, stats.return_rate) == (0.5, 0.25, 0.25)
+    assert stats.target_error == pytest.approx(0.2)
     assert stats.outcomes.sum() == 8
     np.testing.assert_allclose(stats.reward_terms, 2 * np.arange(8) / (2 * 16 * 8))
+
+
+def test_an_epoch_in_which_no_rally_ended_has_no_rates_in_the_record_rather_than_rates_of_nothing(tmp_path):
+    """None ended at all, or none that a generator had validated."""
+    training, record = make_training(), Record(tmp_path / "metrics.csv", tmp_path / "tb")
+    ended = make_rollout(0).episodes
+    for epoch, episodes in enumerate(
+        (
+            ended,
+            replace(ended, unvalidated=np.ones(5, bool)),
+            Episodes(**{field.name: getattr(ended, field.name)[:0] for field in fields(ended)}),
+        )
+    ):
+        record.append(row(training.run_epoch([make_rollout(epoch, episodes=episodes)]), 1.0, 100.0))
+    record.close()
+
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [line["rallies"] for line in rows] == ["4", "0", "0"]
+    for name in ("catch_rate", "over_rate", "return_rate", "target_error", "episode_return"):
+        values = [float(line[name]) for line in rows]
+        np.testing.assert_array_equal(np.isnan(values), [False, True, True], err_msg=name)
 
 
 def test_a_new_normaliser_does_not_change_what_a_later_stage_plays():

@@ -17,15 +17,6 @@ from services.learner.ledger import Ledger, Remembered
 from services.learner.verdicts import Header, Standing
 from tests.unit.services.accounting import ROLLOUT, STANDING, make_header
 
-
-@pytest.fixture(scope="module", autouse=True)
-def a_short_memory():
-    """Let the ledger fold all but the newest rollouts: it must make no difference."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("services.learner.ledger.RECENT", 1)
-        yield
-
-
 OUTBOX = OutboxConfig(retry_first_s=1.0, retry_max_s=4.0, give_up_s=30.0)
 INTAKE = IntakeConfig(dataset_rollouts=2, max_lag=1, queue_rollouts=3)
 
@@ -84,6 +75,7 @@ class World(RuleBasedStateMachine):
         self.requests: list[tuple[Actor, int]] = []  # may be delivered late or twice
         self.replies: list[tuple[Actor, int, Verdict]] = []
         self.reports: list[ActorReport] = []
+        self.out_of_sight: set[tuple[str, int]] = set()  # lives whose token this learner has seen go
 
     # ---- actors
 
@@ -130,8 +122,23 @@ class World(RuleBasedStateMachine):
         actor = self.actors[which]
         self.dead.append(actor)
         self.actors[which] = Actor(actor.name, actor.incarnation + 1)
+        self.lose_sight(actor)
+
+    @rule(which=st.integers(0, 1))
+    def cut_off(self, which: int) -> None:
+        self.lose_sight(self.actors[which])
+
+    @rule(which=st.integers(0, 1))
+    def come_back_into_sight(self, which: int) -> None:
+        life = self.actors[which].name, self.actors[which].incarnation
+        if self.intake is not None:
+            self.intake.seen(*life)
+            self.out_of_sight.discard(life)
+
+    def lose_sight(self, actor: Actor) -> None:
         if self.intake is not None:
             self.intake.gone(actor.name, actor.incarnation)
+            self.out_of_sight.add((actor.name, actor.incarnation))
 
     @rule(which=st.integers(0, 1))
     def write_report(self, which: int) -> None:
@@ -202,17 +209,14 @@ class World(RuleBasedStateMachine):
             assert self.intake.standing.stage_number == entry.header.stage_number
 
     @precondition(lambda self: self.intake is not None and bool(self.dataset))
-    @rule(next_stage=st.booleans(), ending=st.sampled_from(["done", "done", "done", "failed"]))
-    def end_update(self, next_stage: bool, ending: str) -> None:
-        if ending == "failed":
-            self.intake.abandon_update()
-        else:
-            self.trained.update(key_of(entry.header) for entry in self.dataset)
-            old = self.intake.standing
-            stage_number = old.stage_number + next_stage
-            self.intake.finish_update(
-                dataclasses.replace(old, version=old.version + 1, stage_number=stage_number)
-            )
+    @rule(next_stage=st.booleans())
+    def end_update(self, next_stage: bool) -> None:
+        self.trained.update(key_of(entry.header) for entry in self.dataset)
+        old = self.intake.standing
+        stage_number = old.stage_number + next_stage
+        self.intake.finish_update(
+            dataclasses.replace(old, version=old.version + 1, stage_number=stage_number)
+        )
         self.dataset = ()
 
     @precondition(lambda self: self.intake is not None)
@@ -233,6 +237,7 @@ class World(RuleBasedStateMachine):
         self.generations += 1
         standing = dataclasses.replace(self.checkpoint.standing, generation=self.generations)
         self.intake = Intake(INTAKE, standing, self.checkpoint.memory)
+        self.out_of_sight = set()
         self.trained = set(self.checkpoint.trained)
         self.judged = dict(self.checkpoint.judged)
 
@@ -256,11 +261,20 @@ class World(RuleBasedStateMachine):
             assert min(ledger.trained, ledger.dropped, ledger.in_flight, ledger.lost) >= 0
         assert sum(ledgers.values(), Ledger()).trained == len(self.trained)
 
+    @invariant()
+    def of_who_is_out_of_sight_only_what_came_is_in_flight(self) -> None:
+        if self.intake is None:
+            return
+        came = Counter(key_of(entry.header)[:2] for entry in (*self.intake._queue, *self.dataset))
+        for life in self.out_of_sight:
+            assert self.intake.ledgers()[life].in_flight == came[life]
+
     def teardown(self) -> None:
-        """After two reports each, the learner's ledger is what both sides' sets say."""
+        """Once all are in sight and after two reports each, the learner's ledger is what both sides' sets say."""
         if self.intake is None:
             self.restart_learner()
-        for actor in self.actors:
+        for which, actor in enumerate(self.actors):
+            self.come_back_into_sight(which)
             for _ in range(2):
                 actor.outbox = ob.credited(actor.outbox, self.intake.report(actor.report(), self.now))
             ledger = self.intake.ledgers()[actor.name, actor.incarnation]

@@ -5,7 +5,7 @@ import msgpack
 import pytest
 
 from common.comms.codec import encode
-from common.comms.messages import VerdictKind
+from common.comms.messages import ActorReport, VerdictKind
 from services.actor.outbox import Flight, Outbox, OutboxConfig, report
 from services.learner.intake import Intake, IntakeConfig
 from services.learner.ledger import Account, Fate, Remembered, restored
@@ -16,6 +16,7 @@ from tests.unit.learner.rollouts import make_rollout as make_full_rollout
 from tests.unit.services.accounting import ROLLOUT, STANDING, make_header, make_intake
 
 LIMIT = 2**20
+FLIGHT = Flight(0, b"", born=0.0)
 
 
 @pytest.mark.parametrize(
@@ -112,16 +113,45 @@ def test_what_waits_at_a_stage_change_is_lost_and_counted():
     assert (ledger.trained, ledger.lost, ledger.in_flight, ledger.balance) == (1, 2, 0, 0)
 
 
-def test_an_abandoned_update_is_lost():
-    intake = make_intake(dataset_rollouts=1)
-    intake.arrive(make_header(0), ROLLOUT, 0.0)
-    intake.take_dataset()
-    intake.abandon_update()
+def make_report(outbox: Outbox, leaving: bool = False) -> ActorReport:
+    return report(outbox, run="night", actor="actor-0", incarnation=1, version=10, leaving=leaving)
 
+
+def test_what_a_dead_actor_said_before_it_died_does_not_bring_it_back():
+    intake = make_intake(dataset_rollouts=1, max_lag=0)
+    said = make_report(Outbox(OutboxConfig(), next_sequence=2, generation=1, flights=(FLIGHT,)))
+    intake.gone("actor-0", 1)
+    limit = intake.report(said, 0.0).credit_limit
+
+    ledger = intake.ledgers()["actor-0", 1]
+    assert (ledger.published, ledger.in_flight, ledger.lost) == (2, 0, 2)
+    assert limit == 0  # so that there are credits for its next life
+    assert intake.report(dataclasses.replace(said, incarnation=2, published=0), 0.0).credit_limit == 1
+
+
+def test_who_says_goodbye_and_is_seen_again_has_its_missing_rollouts_under_way():
+    """A link that broke while the goodbye was on it: what comes after is for the next goodbye to say."""
+    intake = make_intake()
+    outbox = Outbox(OutboxConfig(), next_sequence=1, generation=1, flights=(FLIGHT,))
+    intake.report(make_report(outbox, leaving=True), 0.0)
     assert intake.ledgers()["actor-0", 1].lost == 1
 
+    intake.seen("actor-0", 1)  # its first sight, which may be read late, says nothing
+    assert intake.ledgers()["actor-0", 1].lost == 1
+    intake.gone("actor-0", 1)
+    intake.seen("actor-0", 1)
 
-def test_a_dead_actors_missing_rollouts_are_lost_until_it_reports_again():
+    assert intake.ledgers()["actor-0", 1].in_flight == 1
+
+
+def test_a_token_of_somebody_who_has_said_nothing_makes_no_account():
+    intake = make_intake()
+    intake.seen("actor-0", 1)
+
+    assert intake.ledgers() == {}
+
+
+def test_a_dead_actors_missing_rollouts_are_lost_until_its_token_returns():
     intake = make_intake()
     intake.arrive(make_header(3), ROLLOUT, 0.0)
     assert intake.ledgers()["actor-0", 1].in_flight == 4
@@ -136,7 +166,9 @@ def test_a_dead_actors_missing_rollouts_are_lost_until_it_reports_again():
     outbox = Outbox(OutboxConfig(), next_sequence=5, generation=1)
     flights = tuple(Flight(sequence, b"", born=0.0) for sequence in range(3))
     outbox = dataclasses.replace(outbox, flights=flights)
-    intake.report(report(outbox, run="night", actor="actor-0", incarnation=1, version=10), 0.0)
+    intake.report(make_report(outbox), 0.0)
+    assert intake.ledgers()["actor-0", 1].lost == 3
+    intake.seen("actor-0", 1)
 
     assert intake.ledgers()["actor-0", 1].lost == 0
 
