@@ -8,8 +8,8 @@ import socket
 import sys
 import time
 import tomllib
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from datetime import datetime
 from pathlib import Path
 from threading import Event
@@ -116,8 +116,9 @@ def settings(argv: Sequence[str]) -> DeployConfig:
     return config.model_copy(update={"run": name})
 
 
-def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
-    """Return name, folder and configuration file of a run, all of it written."""
+@contextmanager
+def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
+    """Yield name, folder and configuration file of a run, all of it written; nobody else can run it meanwhile."""
     run = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
     Keys(run)  # refuses a name that can't stand in a key, and so none that can't be a folder's
     folder = RunFolder.of(run)
@@ -126,6 +127,14 @@ def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
     check_ports(config)
+    with folder.held_by("deploy.local"):
+        folder.check_free_of("learner")  # one started by hand, or one that an earlier run has left to finish
+        write(config, run, folder)
+        yield run, folder, folder.config
+
+
+def write(config: DeployConfig, run: str, folder: RunFolder) -> None:
+    """Make a run's folder with the settings of every process."""
     config = shared_out(config)
     folder.create()
     # A new endpoint each time unless one was asked for: the old one may be taken.
@@ -135,7 +144,6 @@ def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
     local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
     folder.config.write_text(tomli_w.dumps({"local": local} | sections))
     folder.point_latest_here()
-    return run, folder, folder.config
 
 
 def check_ports(config: DeployConfig) -> None:
@@ -300,7 +308,12 @@ def end(family: Family, stop: Event) -> None:
 
 def run(config: DeployConfig, stop: Event) -> int:
     """Run it all; return the exit status: 0 only if the learner did its work."""
-    name, folder, config_file = prepare(config)
+    with prepared(config) as (name, folder, config_file):
+        return run_prepared(config, name, folder, config_file, stop)
+
+
+def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file: Path, stop: Event) -> int:
+    """Run what `prepared` gave; return the exit status."""
     set_up_logging("info", "deploy", folder.logs / LOG_FILE)
     endpoint = load_endpoint(config_file)
     log.info("run=%s folder=%s endpoint=%s actors=%d", name, folder.root, endpoint, config.actors)

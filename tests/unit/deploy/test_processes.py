@@ -8,7 +8,7 @@ from common.config import ConfigError
 from common.process import BAD_CONFIG
 from deploy.child import Assignment
 from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out
-from deploy.local import check_ports, metrics_ports, prepare, settings, specs
+from deploy.local import check_ports, metrics_ports, prepared, settings, specs
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
@@ -133,7 +133,8 @@ def test_environments_and_rollouts_that_were_asked_for_stay(flags, expected):
 def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_given_now(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = settings(["--run", "r", "--actors", "5", "--network.units", "8,4", "--evaluator.rallies", "33"])
-    prepare(first)
+    with prepared(first):
+        pass
 
     again = settings(["--run", "r", "--resume", "--minutes", "3"])
     newest = settings(["--run", "latest", "--resume"])
