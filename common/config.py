@@ -75,6 +75,7 @@ def load(
     section: str,
     environ: Mapping[str, str] | None = None,
     elsewhere: Callable[[Iterable[str]], Mapping[str, str]] = lambda _: {},
+    recorded: Path | None = None,
 ) -> _Model:
     """Return the settings of one service.
 
@@ -85,6 +86,8 @@ def load(
         section: The service's table in the file and its part of the environment's names.
         environ: Environment; the process's by default.
         elsewhere: Of all dotted paths, those that are no flags, and which flag to give instead ("": none).
+        recorded: What a run that goes on has begun with: its file, unless ``--config`` names one. A file that the
+            environment names for whatever is started doesn't take its place.
 
     Raises:
         ConfigError: An unknown or unusable setting.
@@ -94,7 +97,7 @@ def load(
     settings = settings_of(model)
     flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings))
     environment = _read_environment(environ, settings, section)
-    file = file or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+    file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
     layers = (
         flags,
         environment,
@@ -107,10 +110,31 @@ def load(
         raise ConfigError(_first_line(error, settings, layers, section)) from error
 
 
-def to_toml(model: BaseModel, section: str) -> str:
-    """Return the settings as a file that `load` reads back."""
-    values = model.model_dump(mode="json", by_alias=True, exclude_none=True)
-    return tomli_w.dumps({section: values})
+def to_table(model: BaseModel) -> dict[str, Any]:
+    """Return the settings as the table of a file that `load` reads back."""
+    return model.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def record(file: Path, tables: Mapping[str, Any]) -> None:
+    """Put ``tables`` in the place of a settings file's own of these names, in one step; its other tables stay.
+
+    Raises:
+        ConfigError: What is in the file is not TOML.
+    """
+    before = read_toml(file) if file.exists() else {}
+    part = file.with_name(f"{file.name}.part")
+    part.write_text(tomli_w.dumps({**before, **tables}), encoding="utf-8")
+    os.replace(part, file)  # services that are just starting read it
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """Return what is in a settings file. Raises ConfigError if it can't be read or is not TOML."""
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"can't read {file}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is not TOML: {error}") from error
 
 
 def _merged(model: type[_Model], layers: Sequence[_Layer]) -> _Model:
@@ -198,12 +222,7 @@ def _read_environment(environ: Mapping[str, str], settings: Mapping[str, Setting
 
 
 def _read_file(file: str, settings: Mapping[str, Setting], section: str) -> _Layer:
-    try:
-        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"can't read {file}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} is not TOML: {error}") from error
+    content = read_toml(Path(file))
     layer = _Layer()
     shared = [path for path, setting in settings.items() if setting.is_shared]
     for key, value in content.items():

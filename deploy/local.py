@@ -7,7 +7,6 @@ import os
 import socket
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from datetime import datetime
@@ -15,7 +14,6 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-import tomli_w
 from rich.console import Console
 from rich.live import Live
 
@@ -25,7 +23,7 @@ from common.comms.messages import Status
 from common.comms.transport import Transport, TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.config import ConfigError, load
+from common.config import ConfigError, load, read_toml, record
 from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
@@ -110,9 +108,12 @@ def settings(argv: Sequence[str]) -> DeployConfig:
     file = RunFolder.of(name).config
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
-    if not any(word.split("=")[0] == "--config" for word in argv):
-        argv = [*argv, "--config", str(file)]
-        config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
+    if "local" not in read_toml(file):
+        raise ConfigError(
+            f"run {name!r} was started service by service: {file} has no table [local]; go on with: "
+            f"python -m services.learner --run {name} --resume"
+        )
+    config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere, recorded=file)
     return config.model_copy(update={"run": name})
 
 
@@ -142,7 +143,7 @@ def write(config: DeployConfig, run: str, folder: RunFolder) -> None:
         config, run, config.endpoint or free_endpoint(), str(folder.root)
     )
     local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
-    folder.config.write_text(tomli_w.dumps({"local": local} | sections))
+    record(folder.config, {"local": local} | sections)
     folder.point_latest_here()
 
 
@@ -358,7 +359,7 @@ def connect(endpoint: str, stop: Event, family: Family) -> Transport | None:
 
 def load_endpoint(config_file: Path) -> str:
     """Return the endpoint that the run's configuration names."""
-    found: str = tomllib.loads(config_file.read_text())["learner"]["endpoint"]
+    found: str = read_toml(config_file)["learner"]["endpoint"]
     return found
 
 

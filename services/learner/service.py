@@ -22,7 +22,7 @@ from common.comms.messages import (
     Status,
 )
 from common.comms.transport import Flow, Transport
-from common.config import to_toml
+from common.config import record, to_table
 from common.env.robot import home_action
 from common.errors import ReportedError
 from common.metrics import Metrics
@@ -93,8 +93,9 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         self._folder.create()
-        if not self._folder.config.exists():
-            self._folder.config.write_text(to_toml(config, "learner"))
+        # As they now stand; --resume says how this life began, and is no setting of the run.
+        settings = to_table(config.model_copy(update={"resume": False}))
+        record(self._folder.config, {"learner": settings})
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
             config.ppo,

@@ -131,6 +131,18 @@ def test_a_run_is_not_begun_again_by_accident(tmp_path):
     assert "run 'r' exists already in runs/r: go on with --resume, or choose another --run" in line
 
 
+def test_a_run_started_service_by_service_is_not_resumed_as_a_whole(tmp_path):
+    config = tmp_path / "runs" / "r" / "config.toml"
+    config.parent.mkdir(parents=True)
+    config.write_text("[learner]\nseed = 3\n")
+
+    status, line = one_line(tmp_path, DEPLOY, "--run", "r", "--resume", "--panel", "off")
+
+    assert status == 2
+    assert "config.toml has no table [local]; go on with: python -m services.learner --run r --resume" in line
+    assert config.read_text() == "[learner]\nseed = 3\n"
+
+
 def test_a_run_that_is_alive_is_not_begun_or_resumed_beside_itself(tmp_path):
     folder = tmp_path / "runs" / "r"
     with running(tmp_path, DEPLOY, "--run", "r", *TINY) as first:
