@@ -15,6 +15,29 @@ from services.learner.config import LearnerConfig
 from services.learner.intake import IntakeConfig
 
 
+class SharedActorConfig(ActorConfig):
+    """Settings of each actor of a run."""
+
+    envs: int = Field(
+        0,
+        ge=0,
+        le=65536,
+        description="environments of each actor; 0: the actors share 256, and have 16 each at least",
+    )
+
+
+class SharedIntakeConfig(IntakeConfig):
+    """How much data an update takes, and how old it may be."""
+
+    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
+
+
+class SharedLearnerConfig(LearnerConfig):
+    """Settings of the learner of a run."""
+
+    intake: SharedIntakeConfig = SharedIntakeConfig()
+
+
 class DeployConfig(BaseModel):
     """Settings of a run; task, network, launch preset and seed are given once and handed to every process."""
 
@@ -52,29 +75,51 @@ class DeployConfig(BaseModel):
     launch: PresetName = Field("paper", description="launch preset of training")
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
-    learner: LearnerConfig = LearnerConfig()
-    actor: ActorConfig = ActorConfig()
+    learner: SharedLearnerConfig = SharedLearnerConfig()
+    actor: SharedActorConfig = SharedActorConfig()
     generator: GeneratorConfig = GeneratorConfig()
     evaluator: EvaluatorConfig = EvaluatorConfig()
 
 
-ENVS, ROLLOUTS = ActorConfig().envs, IntakeConfig().dataset_rollouts  # of one actor that works alone
-FEWEST_ENVS = 16
+ENVS: Final = ActorConfig().envs  # of one actor that works alone
+FEWEST_ENVS: Final = 16
 
 
 def shared_out(config: DeployConfig) -> DeployConfig:
     """Return ``config`` with its datasets made of one rollout of each actor, which share one actor's environments.
 
-    So a dataset is as large with up to 16 of them. What was asked for, other than what is usual, stays.
+    So a dataset is as large with up to 16 of them. What was asked for stays.
     """
-    actor, learner, intake = config.actor, config.learner, config.learner.intake
-    if actor.envs == ENVS:
-        actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
-    if intake.dataset_rollouts == ROLLOUTS:
-        queue = max(intake.queue_rollouts, 2 * config.actors)
-        intake = intake.model_copy(update={"dataset_rollouts": config.actors, "queue_rollouts": queue})
-    learner = learner.model_copy(update={"intake": intake})
-    return config.model_copy(update={"actor": actor, "learner": learner})
+    envs = config.actor.envs or max(FEWEST_ENVS, ENVS // config.actors)
+    rollouts = config.learner.intake.dataset_rollouts or config.actors
+    # A queue that can't hold a dataset would be the end of training.
+    queue = max(config.learner.intake.queue_rollouts, 2 * rollouts)
+    return _dealt(config, envs, {"dataset_rollouts": rollouts, "queue_rollouts": queue})
+
+
+def shared_again(config: DeployConfig, recorded: DeployConfig, given: DeployConfig) -> DeployConfig:
+    """Return a resumed run's settings, to be shared out anew if they were when it began.
+
+    Releases before this one wrote down what each actor got, not that nobody had asked for it: so both numbers being
+    what that many actors get is taken for it.
+
+    Args:
+        config: What the run goes on with.
+        recorded: What its file says.
+        given: What flags and environment say.
+    """
+    envs, rollouts = recorded.actor.envs, recorded.learner.intake.dataset_rollouts
+    usual = shared_out(DeployConfig(actors=recorded.actors))
+    if (envs, rollouts) != (usual.actor.envs, usual.learner.intake.dataset_rollouts):
+        return config
+    return _dealt(config, given.actor.envs, {"dataset_rollouts": given.learner.intake.dataset_rollouts})
+
+
+def _dealt(config: DeployConfig, envs: int, intake: Mapping[str, int]) -> DeployConfig:
+    learner = config.learner.model_copy(update={"intake": config.learner.intake.model_copy(update=intake)})
+    return config.model_copy(
+        update={"actor": config.actor.model_copy(update={"envs": envs}), "learner": learner}
+    )
 
 
 HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {

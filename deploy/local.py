@@ -29,7 +29,7 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
 from common.run_folder import LATEST, RUNS, RunFolder
-from deploy.config import DeployConfig, given_elsewhere, service_sections, shared_out
+from deploy.config import DeployConfig, given_elsewhere, service_sections, shared_again, shared_out
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
 
@@ -113,8 +113,9 @@ def settings(argv: Sequence[str]) -> DeployConfig:
             f"run {name!r} was started service by service: {file} has no table [local]; go on with: "
             f"python -m services.learner --run {name} --resume"
         )
-    config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere, recorded=file)
-    return config.model_copy(update={"run": name})
+    resumed = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere, recorded=file)
+    before = load(DeployConfig, (), prog=PROG, section="local", environ={}, recorded=file)
+    return shared_again(resumed, before, config).model_copy(update={"run": name})
 
 
 @contextmanager
@@ -135,12 +136,14 @@ def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
 
 
 def write(config: DeployConfig, run: str, folder: RunFolder) -> None:
-    """Make a run's folder with the settings of every process."""
-    config = shared_out(config)
+    """Make a run's folder with the settings of every process.
+
+    What each actor gets is theirs alone: a run that goes on with more of them shares out anew.
+    """
     folder.create()
     # A new endpoint each time unless one was asked for: the old one may be taken.
     sections: dict[str, Any] = service_sections(
-        config, run, config.endpoint or free_endpoint(), str(folder.root)
+        shared_out(config), run, config.endpoint or free_endpoint(), str(folder.root)
     )
     local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
     record(folder.config, {"local": local} | sections)

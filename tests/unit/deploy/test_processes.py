@@ -4,8 +4,9 @@ import time
 
 import pytest
 
-from common.config import ConfigError
+from common.config import ConfigError, record
 from common.process import BAD_CONFIG
+from common.run_folder import RunFolder
 from deploy.child import Assignment
 from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out
 from deploy.local import check_ports, metrics_ports, prepared, settings, specs
@@ -121,7 +122,13 @@ def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
 
 @pytest.mark.parametrize(
     ("flags", "expected"),
-    [(("--actor.envs", "64"), (64, 2)), (("--learner.intake.dataset-rollouts", "3"), (128, 3))],
+    [
+        (("--actor.envs", "64"), (64, 2)),
+        (("--actor.envs", "256"), (256, 2)),
+        (("--learner.intake.dataset-rollouts", "3"), (128, 3)),
+        (("--learner.intake.dataset-rollouts", "1"), (128, 1)),
+        (("--actor.envs", "0", "--learner.intake.dataset-rollouts", "0"), (128, 2)),
+    ],
 )
 def test_environments_and_rollouts_that_were_asked_for_stay(flags, expected):
     config = shared_out(settings(["--run", "r", "--actors", "2", *flags]))
@@ -139,10 +146,57 @@ def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_giv
     again = settings(["--run", "r", "--resume", "--minutes", "3"])
     newest = settings(["--run", "latest", "--resume"])
 
-    assert again == shared_out(first).model_copy(update={"resume": True, "minutes": 3.0})
-    assert shared_out(again) == again
-    assert again.actor.envs == 51
+    assert again == first.model_copy(update={"resume": True, "minutes": 3.0})
     assert newest.run == "r"
+
+
+def dealt(config):
+    """Return what each actor and the learner are told."""
+    sections = service_sections(shared_out(config), "r", "tcp/127.0.0.1:1", "runs/r")
+    return sections["actor"]["envs"], sections["learner"]["intake"]["dataset_rollouts"]
+
+
+@pytest.mark.parametrize(
+    ("begun", "resumed", "expected"),
+    [
+        ((), ("--actors", "8"), (32, 8)),
+        ((), ("--actors", "2", "--actor.envs", "256"), (256, 2)),
+        (("--actor.envs", "256"), ("--actors", "8"), (256, 8)),
+        (("--actor.envs", "256"), (), (256, 2)),
+        (("--learner.intake.dataset-rollouts", "3"), ("--actors", "4"), (64, 3)),
+    ],
+)
+def test_a_run_that_goes_on_with_other_actors_shares_out_anew_what_nobody_asked_for(
+    tmp_path, monkeypatch, begun, resumed, expected
+):
+    monkeypatch.chdir(tmp_path)
+    with prepared(settings(["--run", "r", "--actors", "2", *begun])):
+        pass
+
+    assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
+
+
+@pytest.mark.parametrize(
+    ("recorded", "resumed", "expected"),
+    [
+        ((1, 256, 1), (), (256, 1)),
+        ((1, 256, 1), ("--actors", "2"), (128, 2)),
+        ((1, 256, 1), ("--actors", "2", "--actor.envs", "256"), (256, 2)),
+        ((2, 128, 2), ("--actors", "8"), (32, 8)),
+        ((2, 64, 2), (), (64, 2)),
+        ((2, 64, 2), ("--actors", "4"), (64, 2)),
+    ],
+)
+def test_a_record_of_what_each_actor_got_is_taken_for_nobody_having_asked(
+    tmp_path, monkeypatch, recorded, resumed, expected
+):
+    monkeypatch.chdir(tmp_path)
+    actors, envs, rollouts = recorded
+    local = {"actors": actors, "actor": {"envs": envs}, "learner": {"intake": {"dataset_rollouts": rollouts}}}
+    (tmp_path / "runs" / "r").mkdir(parents=True)
+    record(RunFolder.of("r").config, {"local": local})
+
+    assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
 
 
 def test_a_free_port_passes_the_check():
