@@ -3,8 +3,10 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from common.comms.zenoh_config import ZenohConfig
+from common.config import ConfigError
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
 from common.rally.launch_presets import PresetName
@@ -62,7 +64,14 @@ class DeployConfig(BaseModel):
     )
     frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
     resume: bool = Field(False, description="go on with runs/RUN from its newest checkpoint")
-    endpoint: str = Field("", description="where the learner listens; empty: a free port on this machine")
+    endpoint: str = Field(
+        "",
+        pattern=r"^$|^(tcp|tls|unixsock-stream)/.+",
+        description="where the learner listens; empty: a free port on this machine",
+    )
+    tls_ca: str = Field("", description="file with the authority's certificate; given = mutual TLS")
+    tls_certificate: str = Field("", description="file with this machine's certificate")
+    tls_key: str = Field("", description="file with this machine's private key")
     metrics_port: int = Field(
         0, ge=0, le=64000, description="first port of /metrics, one up for each process; 0: any free ones"
     )
@@ -81,6 +90,7 @@ class DeployConfig(BaseModel):
     evaluator: EvaluatorConfig = EvaluatorConfig()
 
 
+CONNECT_S: Final = 60.0  # for the learner to listen
 ENVS: Final = ActorConfig().envs  # of one actor that works alone
 FEWEST_ENVS: Final = 16
 
@@ -133,7 +143,25 @@ HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
 }  # fmt: skip
 """What a service is told by the run, and which of the run's settings says it; some, only the run knows. Id and index
 are on its command line."""
-_TO_ALL: Final = ("run", "endpoint", "seed")
+_TO_ALL: Final = ("run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed")
+
+
+def way_to_hub(config: DeployConfig, endpoint: str) -> ZenohConfig:
+    """Return how the run's own session gets to the learner: as its services do.
+
+    Raises:
+        ConfigError: TLS without its three files, or they without it.
+    """
+    try:
+        return ZenohConfig(
+            endpoint=endpoint,
+            tls_ca=config.tls_ca,
+            tls_certificate=config.tls_certificate,
+            tls_key=config.tls_key,
+            connect_timeout_s=CONNECT_S,
+        )
+    except ValidationError as error:
+        raise ConfigError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
 
 def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
@@ -154,6 +182,9 @@ def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str)
     told = {
         "run": run,
         "endpoint": endpoint,
+        "tls_ca": config.tls_ca,
+        "tls_certificate": config.tls_certificate,
+        "tls_key": config.tls_key,
         "folder": folder,
         "mode": "hub",
         "seed": config.seed,

@@ -29,7 +29,14 @@ from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
 from common.run_folder import LATEST, RUNS, RunFolder
-from deploy.config import DeployConfig, given_elsewhere, service_sections, shared_again, shared_out
+from deploy.config import (
+    DeployConfig,
+    given_elsewhere,
+    service_sections,
+    shared_again,
+    shared_out,
+    way_to_hub,
+)
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
 
@@ -37,7 +44,6 @@ log = logging.getLogger(__name__)
 
 PROG = "python -m deploy.local"
 WATCH_S = 0.25
-CONNECT_S = 60.0  # for the learner to listen
 LINE_INTERVAL_S = 15.0  # between progress lines when there is no terminal
 LEARNER_PATIENCE_S = 30.0  # it writes a checkpoint
 WORKER_PATIENCE_S = 12.0  # an actor finishes its rollout and waits for the last verdicts
@@ -129,22 +135,21 @@ def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
     check_ports(config)
+    # A new endpoint each time unless one was asked for: the old one may be taken.
+    link = way_to_hub(config, config.endpoint or free_endpoint())
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one started by hand, or one that an earlier run has left to finish
-        write(config, run, folder)
+        write(config, run, folder, link.endpoint)
         yield run, folder, folder.config
 
 
-def write(config: DeployConfig, run: str, folder: RunFolder) -> None:
+def write(config: DeployConfig, run: str, folder: RunFolder, endpoint: str) -> None:
     """Make a run's folder with the settings of every process.
 
     What each actor gets is theirs alone: a run that goes on with more of them shares out anew.
     """
     folder.create()
-    # A new endpoint each time unless one was asked for: the old one may be taken.
-    sections: dict[str, Any] = service_sections(
-        shared_out(config), run, config.endpoint or free_endpoint(), str(folder.root)
-    )
+    sections: dict[str, Any] = service_sections(shared_out(config), run, endpoint, str(folder.root))
     local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
     record(folder.config, {"local": local} | sections)
     folder.point_latest_here()
@@ -324,7 +329,7 @@ def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file
     view = View(name, minutes=config.minutes, frames=config.frames)
     family = Family(specs(config, config_file), folder.logs)
     try:
-        transport = connect(endpoint, stop, family)
+        transport = connect(way_to_hub(config, endpoint), stop, family)
         if transport is not None:
             with closing(transport):
                 watcher = Watcher(view, transport)
@@ -349,11 +354,11 @@ def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file
     return DONE
 
 
-def connect(endpoint: str, stop: Event, family: Family) -> Transport | None:
+def connect(link: ZenohConfig, stop: Event, family: Family) -> Transport | None:
     """Return a connection to the learner, or None if it ended, or a stop was asked for, before it listened."""
     ended = _Ended(stop, family)
     try:
-        return open_zenoh(ZenohConfig(endpoint=endpoint, connect_timeout_s=CONNECT_S), ended)
+        return open_zenoh(link, ended)
     except TransportError:
         if ended.is_set():
             return None

@@ -8,7 +8,7 @@ from common.config import ConfigError, record
 from common.process import BAD_CONFIG
 from common.run_folder import RunFolder
 from deploy.child import Assignment
-from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out
+from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out, way_to_hub
 from deploy.local import check_ports, metrics_ports, prepared, settings, specs
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
@@ -59,10 +59,12 @@ def test_a_run_is_resumed_from_its_checkpoints_and_begun_anew_without_any(tmp_pa
 
 
 def test_all_sections_agree_on_task_run_and_shards():
-    config = DeployConfig(actors=3, launch="strong", env={"noise": "hard", "flight": "full"})
+    config = DeployConfig(
+        actors=3, launch="strong", env={"noise": "hard", "flight": "full"}, tls_ca="certs/ca.pem"
+    )
     sections = service_sections(config, "r", "tcp/127.0.0.1:1", "runs/r")
 
-    for name in ("run", "endpoint", "seed", "launch"):
+    for name in ("run", "endpoint", "tls_ca", "seed", "launch"):
         assert len({str(section[name]) for section in sections.values()}) == 1, name
     assert sections["learner"]["env"] == sections["actor"]["env"] == sections["evaluator"]["env"]
     assert sections["learner"]["network"] == sections["actor"]["network"]
@@ -89,6 +91,9 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         minutes=5,
         frames=6,
         launch="strong",
+        tls_ca="ca.pem",
+        tls_certificate="hub.pem",
+        tls_key="hub.key",
         env={"noise": "hard", "flight": "full"},
         network={"units": (8, 4)},
     )
@@ -97,10 +102,11 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         for config, words in ((DeployConfig(), ("r", "e", "f")), (changed, ("s", "d", "g")))
     )
     by_the_process = {"id", "index"}  # on its command line
+    to_all = {"run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed"}
     for role, names in HANDED_DOWN.items():
         differing = {name for name in usual[role] if usual[role][name] != other[role][name]}
         constant = {"mode"} & set(names)
-        assert differing | constant == (set(names) - by_the_process) | {"run", "endpoint", "seed"}, role
+        assert differing | constant == (set(names) - by_the_process) | to_all, role
 
 
 @pytest.mark.parametrize(
@@ -113,6 +119,7 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         ("--generator.of", "give --generators"),
         ("--evaluator.network.units", "give --network.units"),
         ("--actor.index", "the run sets it"),
+        ("--actor.tls-key", "give --tls-key"),
     ],
 )
 def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
@@ -197,6 +204,38 @@ def test_a_record_of_what_each_actor_got_is_taken_for_nobody_having_asked(
     record(RunFolder.of("r").config, {"local": local})
 
     assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
+
+
+TLS = ("--tls-ca", "ca.pem", "--tls-certificate", "hub.pem", "--tls-key", "hub.key")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--endpoint", "foo"), r"local.endpoint = 'foo' \(--endpoint\); allowed: text, matching .*tcp\|tls"),
+        (("--endpoint", "tls/site:7447"), "allowed: all three with tls/..., none without"),
+        (("--endpoint", "tls/site:7447", *TLS[:4]), "allowed: all three with tls/..., none without"),
+        (TLS, "allowed: all three with tls/..., none without"),
+    ],
+)
+def test_an_endpoint_that_nobody_could_reach_is_refused_before_anything_is_written(
+    tmp_path, monkeypatch, flags, message
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=message), prepared(settings(["--run", "r", *flags])):
+        pass
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_run_itself_gets_to_the_hub_with_the_certificates_of_its_services():
+    config = settings(["--endpoint", "tls/site:7447", *TLS])
+
+    link = way_to_hub(config, config.endpoint)
+
+    assert (link.endpoint, link.tls_ca, link.tls_certificate, link.tls_key) == (
+        *("tls/site:7447", "ca.pem", "hub.pem", "hub.key"),
+    )
 
 
 def test_a_free_port_passes_the_check():
