@@ -2,7 +2,8 @@
 
 * Flags: ``--max-lag 1``, ``--ppo.clip 0.2``; a list is ``a,b``.
 * Environment: ``TOPSPIN_LEARNER__PPO__CLIP=0.2`` for one service; ``TOPSPIN_RUN=night`` for a setting that
-  all services share, which is one that the model inherits.
+  all services share, which is one that the model inherits. A program that starts services hears only its own:
+  ``TOPSPIN_LOCAL__LEARNER__PPO__CLIP=0.2``.
 * File (``--config``, or ``TOPSPIN_CONFIG``): a table per service (``[learner]``), shared settings above them.
 
 Whatever nobody reads is an error that suggests the nearest name: a mistyped setting never runs a whole night
@@ -96,7 +97,7 @@ def load(
     environ = os.environ if environ is None else environ
     settings = settings_of(model)
     flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings))
-    environment = _read_environment(environ, settings, section)
+    environment = _read_environment(environ, settings, section, elsewhere(settings))
     file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
     layers = (
         flags,
@@ -204,16 +205,30 @@ def _read_flags(
 _BOOLEANS: Final = ("true", "false", "yes", "no", "on", "off", "1", "0")
 
 
-def _read_environment(environ: Mapping[str, str], settings: Mapping[str, Setting], section: str) -> _Layer:
+def _read_environment(
+    environ: Mapping[str, str], settings: Mapping[str, Setting], section: str, elsewhere: Mapping[str, str]
+) -> _Layer:
     layer = _Layer()
     names = {_variable(path, section): path for path in settings}
     shared = {f"{ENVIRONMENT_PREFIX}{path.upper()}": path for path in settings if settings[path].is_shared}
-    others = tuple(f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in SECTIONS if other != section)
+    # A program that has others' settings among its own starts them, and tells them all: their variables set nothing.
+    started = {path.split(".")[0] for path in settings if "." in path} & set(SECTIONS)
+    theirs = tuple(f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in started)
+    others = tuple(
+        f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in SECTIONS if other not in (section, *started)
+    )
     # a service's own variable beats the shared one, so it is put last
     for variable in sorted(environ, key=lambda variable: variable in names):
         if not variable.startswith(ENVIRONMENT_PREFIX) or variable.startswith(others):
             continue
-        path = names.get(variable) or shared.get(variable)
+        ours = variable
+        if variable.startswith(theirs):
+            ours = variable.replace(ENVIRONMENT_PREFIX, f"{ENVIRONMENT_PREFIX}{section.upper()}__", 1)
+        path = names.get(ours) or shared.get(ours)
+        if path is not None and (path in elsewhere or ours != variable):
+            instead = elsewhere.get(path, path)
+            what = f"set {_variable(instead, section)}" if instead else "the run sets it"
+            raise ConfigError(f"{variable} would set nothing here: {what}")
         if path is not None:
             layer.put(path, settings[path].parse(environ[variable]), variable)
         elif variable != f"{ENVIRONMENT_PREFIX}CONFIG":

@@ -128,6 +128,33 @@ def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
 
 
 @pytest.mark.parametrize(
+    ("variable", "instead"),
+    [
+        ("TOPSPIN_LEARNER__PPO__CLIP", "set TOPSPIN_LOCAL__LEARNER__PPO__CLIP$"),
+        ("TOPSPIN_LEARNER__ENV__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_LOCAL__LEARNER__ENV__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_GENERATOR__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_ACTOR__INDEX", "the run sets it$"),
+    ],
+)
+def test_a_variable_that_no_service_of_a_run_would_hear_of_is_refused(monkeypatch, variable, instead):
+    monkeypatch.setenv(variable, "1")
+
+    with pytest.raises(ConfigError, match=f"^{variable} would set nothing here: {instead}"):
+        settings([])
+
+
+def test_variables_of_a_run_reach_its_services_by_its_settings(monkeypatch):
+    monkeypatch.setenv("TOPSPIN_LOCAL__LEARNER__PPO__CLIP", "0.1")
+    monkeypatch.setenv("TOPSPIN_PLAY__RALLIES", "7")
+
+    assert service_sections(settings([]), "r", "e", "f")["learner"]["ppo"]["clip"] == 0.1
+    monkeypatch.setenv("TOPSPIN_LEARNER__PPO__CLAP", "0.1")
+    with pytest.raises(ConfigError, match="CLAP; did you mean 'TOPSPIN_LOCAL__LEARNER__PPO__CLIP'"):
+        settings([])
+
+
+@pytest.mark.parametrize(
     ("flags", "expected"),
     [
         (("--actor.envs", "64"), (64, 2)),
@@ -281,6 +308,19 @@ def test_a_process_that_dies_is_started_again_and_its_log_goes_on(tmp_path, serv
     assert alive
     assert child.exits == [-signal.SIGKILL]
     assert child.process.poll() is not None
+
+
+def test_a_process_gets_the_environment_but_no_settings_from_it(tmp_path, service, monkeypatch):
+    (tmp_path / "stand_in.py").write_text(
+        "import os\nprint('heard', os.environ.get('TOPSPIN_CONFIG'), os.environ.get('ELSE'), flush=True)\n"
+    )
+    monkeypatch.setenv("TOPSPIN_CONFIG", "other.toml")
+    monkeypatch.setenv("ELSE", "kept")
+    family = kept(tmp_path, service)
+    wait_until(lambda: family.status_of("worker-0") is not None)
+    family.stop(["worker-0"], 1.0)
+
+    assert family.last_line("worker-0") == "heard None kept"
 
 
 def test_a_process_that_cannot_use_its_settings_is_not_started_again(tmp_path, service):
