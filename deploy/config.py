@@ -59,10 +59,12 @@ class DeployConfig(BaseModel):
     minutes: float = Field(
         0.0,
         ge=0,
-        description="stop this long after the first trained batch; 0: the whole curriculum",
+        description="stop this long after the first trained batch, counted through restarts; 0: the whole curriculum",
         json_schema_extra={"unit": "min"},
     )
-    frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
+    frames: int = Field(
+        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
+    )
     resume: bool = Field(False, description="go on with runs/RUN from its newest checkpoint")
     endpoint: str = Field(
         "",

@@ -39,6 +39,7 @@ from deploy.config import (
 )
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
+from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 
 log = logging.getLogger(__name__)
 
@@ -186,13 +187,28 @@ def outcome(run: str, folder: RunFolder, learner: Status | None) -> dict[str, An
     }
 
 
+def last_epoch(folder: RunFolder) -> dict[str, str]:
+    """Return the last row of a run's metrics.csv; {} before anything is trained."""
+    if not folder.metrics.exists():
+        return {}
+    with folder.metrics.open(newline="") as file:
+        # a learner that was killed may have left half a line at the end
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+    return rows[-1] if rows else {}
+
+
 def trained_seconds(folder: RunFolder) -> float:
     """Return the time from the first trained batch to the last, through restarts [s]."""
-    if not folder.metrics.exists():
-        return 0.0
-    with folder.metrics.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return round(float(rows[-1]["seconds"]), 1) if rows else 0.0
+    return round(float(last_epoch(folder).get("seconds", 0.0)), 1)
+
+
+def spent(config: DeployConfig, folder: RunFolder) -> str:
+    """Return the limit that a run had reached before, such as "10 of 10 minutes", or ""."""
+    last = last_epoch(folder)
+    if not (config.resume and last):
+        return ""
+    budget = Budget(config.learner.curriculum.epochs, config.frames, config.minutes)
+    return budget.spent(int(last["epoch"]), int(last["frames"]), float(last["seconds"]), ENDING_S)
 
 
 def final_measures(folder: RunFolder, config: DeployConfig, stop: Event) -> dict[str, Any]:
@@ -326,6 +342,10 @@ def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file
     set_up_logging("info", "deploy", folder.logs / LOG_FILE)
     endpoint = load_endpoint(config_file)
     log.info("run=%s folder=%s endpoint=%s actors=%d", name, folder.root, endpoint, config.actors)
+    if done := spent(config, folder):
+        log.warning(
+            NOTHING_LEFT, done, "learner."
+        )  # and so the learner ends at once, and its policy is measured
     view = View(name, minutes=config.minutes, frames=config.frames)
     family = Family(specs(config, config_file), folder.logs)
     try:

@@ -32,6 +32,7 @@ from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
 from services.learner import checkpoint
+from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.guard import NOT_FINITE
 from services.learner.intake import Intake
@@ -144,14 +145,15 @@ class LearnerService:
     @property
     def done(self) -> bool:
         """Whether the budget is spent, or a stop was asked for."""
-        config, progress, clocks = self._config, self.training.progress, self._clocks
+        clocks = self._clocks
         spent_s = self._clock() - clocks.first_trained if clocks.first_trained >= 0 else 0.0
-        return (
-            self._stopping
-            or progress.epoch >= config.curriculum.epochs
-            or 0 < config.frames <= progress.frames
-            or 0 < config.minutes * 60.0 <= spent_s + clocks.resumed_seconds
-        )
+        return self._stopping or bool(self._spent(spent_s + clocks.resumed_seconds))
+
+    def _spent(self, seconds: float, slack_s: float = 0.0) -> str:
+        """Return the limit that is reached after so many seconds of training, or ""."""
+        config, progress = self._config, self.training.progress
+        budget = Budget(config.curriculum.epochs, config.frames, config.minutes)
+        return budget.spent(progress.epoch, progress.frames, seconds, slack_s)
 
     def ledger(self) -> Ledger:
         """Return the account of all actors together."""
@@ -171,6 +173,9 @@ class LearnerService:
             config.curriculum.epochs,
             *(config.run, config.endpoint) * 2,
         )
+        if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
+            log.warning(NOTHING_LEFT, spent, "")
+            self._stopping = True
         try:
             while not stop.is_set() and not self.done:
                 wait = self.step()

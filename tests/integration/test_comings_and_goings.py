@@ -128,6 +128,28 @@ def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp
     assert min(reconnects) >= 1
 
 
+@pytest.mark.parametrize(
+    ("budget", "spent"), [({"frames": 2048}, "2,048 of 2,048 frames"), ({"minutes": 0.02}, "of 0.02 minutes")]
+)
+def test_a_learner_that_goes_on_with_its_budget_spent_says_so_and_trains_nothing(
+    tmp_path, caplog, budget, spent
+):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner(**budget)
+        s.generator()
+        actors = [s.actor(0), s.actor(1)]
+        learner.join(60)
+        s.take_down(learner)
+        again = s.learner(resume=True, **budget)
+        again.join(30)
+        for actor in actors:
+            actor.end()
+        trained = progress(learner).epoch, progress(again).epoch
+
+    assert trained[0] == trained[1] > 0
+    assert f"{spent} are trained, through all restarts; give --minutes or --frames more" in caplog.text
+
+
 def test_a_second_run_does_not_overwrite_the_first_ones_checkpoints(tmp_path):
     with stage(tmp_path) as s:
         s.take_down(s.learner())

@@ -9,7 +9,7 @@ from common.process import BAD_CONFIG
 from common.run_folder import RunFolder
 from deploy.child import Assignment
 from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out, way_to_hub
-from deploy.local import check_ports, metrics_ports, prepared, settings, specs
+from deploy.local import check_ports, metrics_ports, prepared, settings, specs, spent
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
@@ -263,6 +263,21 @@ def test_the_run_itself_gets_to_the_hub_with_the_certificates_of_its_services():
     assert (link.endpoint, link.tls_ca, link.tls_certificate, link.tls_key) == (
         *("tls/site:7447", "ca.pem", "hub.pem", "hub.key"),
     )
+
+
+def test_a_resumed_run_whose_budget_is_spent_is_told_what_is(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.metrics.write_text(
+        "epoch,frames,seconds\n1,8192,1.5\n900,7372800,599.8\n901,73"
+    )  # killed in a line
+    resumed = CONFIG.model_copy(update={"resume": True, "minutes": 10.0})
+
+    assert spent(resumed, folder) == "10 of 10 minutes"
+    assert spent(resumed.model_copy(update={"minutes": 0.0}), folder) == ""
+    assert spent(resumed.model_copy(update={"minutes": 20.0, "frames": 7_000_000}), folder) == (
+        "7,372,800 of 7,000,000 frames"
+    )
+    assert spent(resumed, RunFolder(tmp_path / "nothing")) == ""
 
 
 def test_a_free_port_passes_the_check():
