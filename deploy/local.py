@@ -72,7 +72,7 @@ def specs(config: DeployConfig, config_file: Path) -> list[Spec]:
 
     def service(role: str, index: int, *more: str) -> Spec:
         arguments = ("--config", str(config_file), "--id", str(index), "--metrics-port", str(next(ports)))
-        # The learner holds the run's state: its death ends the run, with its exit status, and --resume goes on.
+        # The learner holds the run's state: its death ends the run, and --resume goes on.
         return Spec(
             f"{role}-{index}", role, (f"services.{role}", *arguments, *more), restart=role != "learner"
         )

@@ -131,6 +131,8 @@ class LearnerService:
         self._blob = self._average = b""
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         self.state = "waiting"
+        # Or one that waits for its first actor would have been without a checkpoint since 1970.
+        metrics.set("topspin_checkpoint_time_seconds", time.time())
         self._publish_policy()
         self._transport.publish(keys.stage(), encode(self._stages[-1]), Flow.STAGE)
 

@@ -3,6 +3,7 @@
 import logging
 import shutil
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -65,6 +66,14 @@ def test_an_actor_that_comes_late_gets_policy_and_stage_and_takes_part(tmp_path)
     assert refused == {}
     assert learner.service.ledger().lost == 0
     assert learner.service.ledger().balance == 0
+
+
+def test_a_learner_that_waits_for_its_first_actor_has_not_been_without_a_checkpoint_since_1970(tmp_path):
+    started = time.time()
+    with stage(tmp_path) as s:
+        waiting = s.learner(run=False).metric("topspin_checkpoint_time_seconds")
+
+    assert started <= waiting <= time.time()
 
 
 def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_path):
