@@ -20,8 +20,9 @@ from common.comms.keys import Keys
 from common.comms.messages import Status
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
+from common.run_folder import RunFolder
 from deploy.config import DeployConfig
-from deploy.local import load_endpoint, prepare, specs
+from deploy.local import load_endpoint, prepared, specs
 from deploy.processes import Family
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
@@ -34,7 +35,14 @@ def cpu_seconds(processes: list[psutil.Process]) -> float:
 
 def measure(config: DeployConfig, warm_up_s: float, seconds: float) -> dict[str, Any]:
     """Return the figures of one run."""
-    run, folder, config_file = prepare(config)
+    with prepared(config) as (run, folder, config_file):
+        return measure_prepared(config, run, folder, config_file, warm_up_s, seconds)
+
+
+def measure_prepared(
+    config: DeployConfig, run: str, folder: RunFolder, config_file: Path, warm_up_s: float, seconds: float
+) -> dict[str, Any]:
+    """Return the figures of the run that `prepared` gave."""
     family = Family(specs(config, config_file), folder.logs)
     transport = None
     learner: Status | None = None

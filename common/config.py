@@ -2,7 +2,8 @@
 
 * Flags: ``--max-lag 1``, ``--ppo.clip 0.2``; a list is ``a,b``.
 * Environment: ``TOPSPIN_LEARNER__PPO__CLIP=0.2`` for one service; ``TOPSPIN_RUN=night`` for a setting that
-  all services share, which is one that the model inherits.
+  all services share, which is one that the model inherits. A program that starts services hears only its own:
+  ``TOPSPIN_LOCAL__LEARNER__PPO__CLIP=0.2``.
 * File (``--config``, or ``TOPSPIN_CONFIG``): a table per service (``[learner]``), shared settings above them.
 
 Whatever nobody reads is an error that suggests the nearest name: a mistyped setting never runs a whole night
@@ -75,6 +76,7 @@ def load(
     section: str,
     environ: Mapping[str, str] | None = None,
     elsewhere: Callable[[Iterable[str]], Mapping[str, str]] = lambda _: {},
+    recorded: Path | None = None,
 ) -> _Model:
     """Return the settings of one service.
 
@@ -85,6 +87,8 @@ def load(
         section: The service's table in the file and its part of the environment's names.
         environ: Environment; the process's by default.
         elsewhere: Of all dotted paths, those that are no flags, and which flag to give instead ("": none).
+        recorded: What a run that goes on has begun with: its file, unless ``--config`` names one. A file that the
+            environment names for whatever is started doesn't take its place.
 
     Raises:
         ConfigError: An unknown or unusable setting.
@@ -93,8 +97,8 @@ def load(
     environ = os.environ if environ is None else environ
     settings = settings_of(model)
     flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings))
-    environment = _read_environment(environ, settings, section)
-    file = file or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+    environment = _read_environment(environ, settings, section, elsewhere(settings))
+    file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
     layers = (
         flags,
         environment,
@@ -107,10 +111,31 @@ def load(
         raise ConfigError(_first_line(error, settings, layers, section)) from error
 
 
-def to_toml(model: BaseModel, section: str) -> str:
-    """Return the settings as a file that `load` reads back."""
-    values = model.model_dump(mode="json", by_alias=True, exclude_none=True)
-    return tomli_w.dumps({section: values})
+def to_table(model: BaseModel) -> dict[str, Any]:
+    """Return the settings as the table of a file that `load` reads back."""
+    return model.model_dump(mode="json", by_alias=True, exclude_none=True)
+
+
+def record(file: Path, tables: Mapping[str, Any]) -> None:
+    """Put ``tables`` in the place of a settings file's own of these names, in one step; its other tables stay.
+
+    Raises:
+        ConfigError: What is in the file is not TOML.
+    """
+    before = read_toml(file) if file.exists() else {}
+    part = file.with_name(f"{file.name}.part")
+    part.write_text(tomli_w.dumps({**before, **tables}), encoding="utf-8")
+    os.replace(part, file)  # services that are just starting read it
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """Return what is in a settings file. Raises ConfigError if it can't be read or is not TOML."""
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"can't read {file}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is not TOML: {error}") from error
 
 
 def _merged(model: type[_Model], layers: Sequence[_Layer]) -> _Model:
@@ -180,16 +205,30 @@ def _read_flags(
 _BOOLEANS: Final = ("true", "false", "yes", "no", "on", "off", "1", "0")
 
 
-def _read_environment(environ: Mapping[str, str], settings: Mapping[str, Setting], section: str) -> _Layer:
+def _read_environment(
+    environ: Mapping[str, str], settings: Mapping[str, Setting], section: str, elsewhere: Mapping[str, str]
+) -> _Layer:
     layer = _Layer()
     names = {_variable(path, section): path for path in settings}
     shared = {f"{ENVIRONMENT_PREFIX}{path.upper()}": path for path in settings if settings[path].is_shared}
-    others = tuple(f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in SECTIONS if other != section)
+    # A program that has others' settings among its own starts them, and tells them all: their variables set nothing.
+    started = {path.split(".")[0] for path in settings if "." in path} & set(SECTIONS)
+    theirs = tuple(f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in started)
+    others = tuple(
+        f"{ENVIRONMENT_PREFIX}{other.upper()}__" for other in SECTIONS if other not in (section, *started)
+    )
     # a service's own variable beats the shared one, so it is put last
     for variable in sorted(environ, key=lambda variable: variable in names):
         if not variable.startswith(ENVIRONMENT_PREFIX) or variable.startswith(others):
             continue
-        path = names.get(variable) or shared.get(variable)
+        ours = variable
+        if variable.startswith(theirs):
+            ours = variable.replace(ENVIRONMENT_PREFIX, f"{ENVIRONMENT_PREFIX}{section.upper()}__", 1)
+        path = names.get(ours) or shared.get(ours)
+        if path is not None and (path in elsewhere or ours != variable):
+            instead = elsewhere.get(path, path)
+            what = f"set {_variable(instead, section)}" if instead else "the run sets it"
+            raise ConfigError(f"{variable} would set nothing here: {what}")
         if path is not None:
             layer.put(path, settings[path].parse(environ[variable]), variable)
         elif variable != f"{ENVIRONMENT_PREFIX}CONFIG":
@@ -198,12 +237,7 @@ def _read_environment(environ: Mapping[str, str], settings: Mapping[str, Setting
 
 
 def _read_file(file: str, settings: Mapping[str, Setting], section: str) -> _Layer:
-    try:
-        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"can't read {file}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file} is not TOML: {error}") from error
+    content = read_toml(Path(file))
     layer = _Layer()
     shared = [path for path, setting in settings.items() if setting.is_shared]
     for key, value in content.items():

@@ -100,7 +100,13 @@ METRICS: Final = _table(
     Metric("topspin_stage", "gauge", "1", "Stage of the curriculum", (_A, _L)),
     Metric("topspin_epoch", "gauge", "epochs", "Datasets trained", (_L,)),
     Metric("topspin_rollbacks_total", "counter", "1", "Returns to a good checkpoint after divergence", (_L,)),
-    Metric("topspin_checkpoint_time_seconds", "gauge", "s since 1970", "When the newest was written", (_L,)),
+    Metric(
+        "topspin_checkpoint_time_seconds",
+        "gauge",
+        "s since 1970",
+        "When the newest was written; until then, when the learner started",
+        (_L,),
+    ),
     # rollouts
     Metric("topspin_rollouts_published_total", "counter", "rollouts", "Rollouts numbered", (_A,)),
     Metric("topspin_rollouts_accepted_total", "counter", "rollouts", "Final verdict accepted", (_A,)),

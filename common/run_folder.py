@@ -1,11 +1,25 @@
-"""Where a run keeps its things."""
+"""Where a run keeps its things, and who may write there."""
 
+import fcntl
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
+
+from common.errors import ReportedError
 
 RUNS = Path("runs")
 LATEST = "latest"
+
+Holder = Literal["learner", "deploy.local"]
+LOCKS: Final[dict[Holder, str]] = {"learner": ".lock", "deploy.local": ".deploy.lock"}
+"""What each writer of a run folder holds while it lives, the file's name. Two, since deploy.local starts a learner."""
+
+
+class RunAliveError(ReportedError):
+    """Somebody else is at work in a run folder: one line that names the process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +82,48 @@ class RunFolder:
         """Make the folders."""
         for path in (self.tensorboard, self.checkpoints, self.latest_policy.parent, self.logs, self.report):
             path.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def held_by(self, holder: Holder) -> Iterator[None]:
+        """Keep the folder to the only ``holder`` at work in it; the kernel lets it go when the process ends, however.
+
+        Raises:
+            RunAliveError: It has one already.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        # Closed in whatever process we start: a lock lives as long as anybody has the file open.
+        file = os.open(self._lock(holder), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            self._take(file, fcntl.LOCK_EX, holder)
+            os.truncate(file, 0)
+            os.write(file, f"{os.getpid()}\n".encode())
+            yield
+        finally:
+            os.close(file)  # the file stays: who removed it might remove it under another who just took it
+
+    def check_free_of(self, holder: Holder) -> None:
+        """Raise RunAliveError if a ``holder`` is at work in the folder; nothing is written."""
+        try:
+            file = os.open(self._lock(holder), os.O_RDONLY | os.O_CLOEXEC)
+        except FileNotFoundError:
+            return
+        try:
+            self._take(file, fcntl.LOCK_SH, holder)
+        finally:
+            os.close(file)
+
+    def _lock(self, holder: Holder) -> Path:
+        return self.root / LOCKS[holder]
+
+    def _take(self, file: int, how: int, holder: Holder) -> None:
+        try:
+            fcntl.flock(file, how | fcntl.LOCK_NB)
+        except BlockingIOError:
+            process = self._lock(holder).read_text().strip() or "that is just starting"
+            raise RunAliveError(
+                f"run {self.root.name!r} is alive: {holder}, process {process}, is at work in {self.root}; "
+                "end it first, or choose another --run"
+            ) from None
 
     def point_latest_here(self) -> None:
         """Let runs/latest name this run."""

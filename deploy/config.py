@@ -3,8 +3,10 @@
 from collections.abc import Iterable, Mapping
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from common.comms.zenoh_config import ZenohConfig
+from common.config import ConfigError
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
 from common.rally.launch_presets import PresetName
@@ -13,6 +15,29 @@ from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
 from services.learner.intake import IntakeConfig
+
+
+class SharedActorConfig(ActorConfig):
+    """Settings of each actor of a run."""
+
+    envs: int = Field(
+        0,
+        ge=0,
+        le=65536,
+        description="environments of each actor; 0: the actors share 256, and have 16 each at least",
+    )
+
+
+class SharedIntakeConfig(IntakeConfig):
+    """How much data an update takes, and how old it may be."""
+
+    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
+
+
+class SharedLearnerConfig(LearnerConfig):
+    """Settings of the learner of a run."""
+
+    intake: SharedIntakeConfig = SharedIntakeConfig()
 
 
 class DeployConfig(BaseModel):
@@ -34,12 +59,21 @@ class DeployConfig(BaseModel):
     minutes: float = Field(
         0.0,
         ge=0,
-        description="stop this long after the first trained batch; 0: the whole curriculum",
+        description="stop this long after the first trained batch, counted through restarts; 0: the whole curriculum",
         json_schema_extra={"unit": "min"},
     )
-    frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
+    frames: int = Field(
+        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
+    )
     resume: bool = Field(False, description="go on with runs/RUN from its newest checkpoint")
-    endpoint: str = Field("", description="where the learner listens; empty: a free port on this machine")
+    endpoint: str = Field(
+        "",
+        pattern=r"^$|^(tcp|tls|unixsock-stream)/.+",
+        description="where the learner listens; empty: a free port on this machine",
+    )
+    tls_ca: str = Field("", description="file with the authority's certificate; given = mutual TLS")
+    tls_certificate: str = Field("", description="file with this machine's certificate")
+    tls_key: str = Field("", description="file with this machine's private key")
     metrics_port: int = Field(
         0, ge=0, le=64000, description="first port of /metrics, one up for each process; 0: any free ones"
     )
@@ -52,29 +86,52 @@ class DeployConfig(BaseModel):
     launch: PresetName = Field("paper", description="launch preset of training")
     env: EnvConfig = EnvConfig()
     network: NetworkConfig = NetworkConfig()
-    learner: LearnerConfig = LearnerConfig()
-    actor: ActorConfig = ActorConfig()
+    learner: SharedLearnerConfig = SharedLearnerConfig()
+    actor: SharedActorConfig = SharedActorConfig()
     generator: GeneratorConfig = GeneratorConfig()
     evaluator: EvaluatorConfig = EvaluatorConfig()
 
 
-ENVS, ROLLOUTS = ActorConfig().envs, IntakeConfig().dataset_rollouts  # of one actor that works alone
-FEWEST_ENVS = 16
+CONNECT_S: Final = 60.0  # for the learner to listen
+ENVS: Final = ActorConfig().envs  # of one actor that works alone
+FEWEST_ENVS: Final = 16
 
 
 def shared_out(config: DeployConfig) -> DeployConfig:
     """Return ``config`` with its datasets made of one rollout of each actor, which share one actor's environments.
 
-    So a dataset is as large with up to 16 of them. What was asked for, other than what is usual, stays.
+    So a dataset is as large with up to 16 of them. What was asked for stays.
     """
-    actor, learner, intake = config.actor, config.learner, config.learner.intake
-    if actor.envs == ENVS:
-        actor = actor.model_copy(update={"envs": max(FEWEST_ENVS, ENVS // config.actors)})
-    if intake.dataset_rollouts == ROLLOUTS:
-        queue = max(intake.queue_rollouts, 2 * config.actors)
-        intake = intake.model_copy(update={"dataset_rollouts": config.actors, "queue_rollouts": queue})
-    learner = learner.model_copy(update={"intake": intake})
-    return config.model_copy(update={"actor": actor, "learner": learner})
+    envs = config.actor.envs or max(FEWEST_ENVS, ENVS // config.actors)
+    rollouts = config.learner.intake.dataset_rollouts or config.actors
+    # A queue that can't hold a dataset would be the end of training.
+    queue = max(config.learner.intake.queue_rollouts, 2 * rollouts)
+    return _dealt(config, envs, {"dataset_rollouts": rollouts, "queue_rollouts": queue})
+
+
+def shared_again(config: DeployConfig, recorded: DeployConfig, given: DeployConfig) -> DeployConfig:
+    """Return a resumed run's settings, to be shared out anew if they were when it began.
+
+    Releases before this one wrote down what each actor got, not that nobody had asked for it: so both numbers being
+    what that many actors get is taken for it.
+
+    Args:
+        config: What the run goes on with.
+        recorded: What its file says.
+        given: What flags and environment say.
+    """
+    envs, rollouts = recorded.actor.envs, recorded.learner.intake.dataset_rollouts
+    usual = shared_out(DeployConfig(actors=recorded.actors))
+    if (envs, rollouts) != (usual.actor.envs, usual.learner.intake.dataset_rollouts):
+        return config
+    return _dealt(config, given.actor.envs, {"dataset_rollouts": given.learner.intake.dataset_rollouts})
+
+
+def _dealt(config: DeployConfig, envs: int, intake: Mapping[str, int]) -> DeployConfig:
+    learner = config.learner.model_copy(update={"intake": config.learner.intake.model_copy(update=intake)})
+    return config.model_copy(
+        update={"actor": config.actor.model_copy(update={"envs": envs}), "learner": learner}
+    )
 
 
 HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
@@ -88,7 +145,25 @@ HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
 }  # fmt: skip
 """What a service is told by the run, and which of the run's settings says it; some, only the run knows. Id and index
 are on its command line."""
-_TO_ALL: Final = ("run", "endpoint", "seed")
+_TO_ALL: Final = ("run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed")
+
+
+def way_to_hub(config: DeployConfig, endpoint: str) -> ZenohConfig:
+    """Return how the run's own session gets to the learner: as its services do.
+
+    Raises:
+        ConfigError: TLS without its three files, or they without it.
+    """
+    try:
+        return ZenohConfig(
+            endpoint=endpoint,
+            tls_ca=config.tls_ca,
+            tls_certificate=config.tls_certificate,
+            tls_key=config.tls_key,
+            connect_timeout_s=CONNECT_S,
+        )
+    except ValidationError as error:
+        raise ConfigError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None
 
 
 def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
@@ -109,6 +184,9 @@ def service_sections(config: DeployConfig, run: str, endpoint: str, folder: str)
     told = {
         "run": run,
         "endpoint": endpoint,
+        "tls_ca": config.tls_ca,
+        "tls_certificate": config.tls_certificate,
+        "tls_key": config.tls_key,
         "folder": folder,
         "mode": "hub",
         "seed": config.seed,

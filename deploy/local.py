@@ -7,15 +7,13 @@ import os
 import socket
 import sys
 import time
-import tomllib
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from datetime import datetime
 from pathlib import Path
 from threading import Event
 from typing import Any
 
-import tomli_w
 from rich.console import Console
 from rich.live import Live
 
@@ -25,21 +23,28 @@ from common.comms.messages import Status
 from common.comms.transport import Transport, TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.config import ConfigError, load
+from common.config import ConfigError, load, read_toml, record
 from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
 from common.run_folder import LATEST, RUNS, RunFolder
-from deploy.config import DeployConfig, given_elsewhere, service_sections, shared_out
+from deploy.config import (
+    DeployConfig,
+    given_elsewhere,
+    service_sections,
+    shared_again,
+    shared_out,
+    way_to_hub,
+)
 from deploy.panel import STALE_S, View, clock, render, time_left_s
 from deploy.processes import Family, Spec
+from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 
 log = logging.getLogger(__name__)
 
 PROG = "python -m deploy.local"
 WATCH_S = 0.25
-CONNECT_S = 60.0  # for the learner to listen
 LINE_INTERVAL_S = 15.0  # between progress lines when there is no terminal
 LEARNER_PATIENCE_S = 30.0  # it writes a checkpoint
 WORKER_PATIENCE_S = 12.0  # an actor finishes its rollout and waits for the last verdicts
@@ -67,7 +72,7 @@ def specs(config: DeployConfig, config_file: Path) -> list[Spec]:
 
     def service(role: str, index: int, *more: str) -> Spec:
         arguments = ("--config", str(config_file), "--id", str(index), "--metrics-port", str(next(ports)))
-        # The learner holds the run's state: its death ends the run, with its exit status, and --resume goes on.
+        # The learner holds the run's state: its death ends the run, and --resume goes on.
         return Spec(
             f"{role}-{index}", role, (f"services.{role}", *arguments, *more), restart=role != "learner"
         )
@@ -110,14 +115,19 @@ def settings(argv: Sequence[str]) -> DeployConfig:
     file = RunFolder.of(name).config
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
-    if not any(word.split("=")[0] == "--config" for word in argv):
-        argv = [*argv, "--config", str(file)]
-        config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
-    return config.model_copy(update={"run": name})
+    if "local" not in read_toml(file):
+        raise ConfigError(
+            f"run {name!r} was started service by service: {file} has no table [local]; go on with: "
+            f"python -m services.learner --run {name} --resume"
+        )
+    resumed = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere, recorded=file)
+    before = load(DeployConfig, (), prog=PROG, section="local", environ={}, recorded=file)
+    return shared_again(resumed, before, config).model_copy(update={"run": name})
 
 
-def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
-    """Return name, folder and configuration file of a run, all of it written."""
+@contextmanager
+def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
+    """Yield name, folder and configuration file of a run, all of it written; nobody else can run it meanwhile."""
     run = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
     Keys(run)  # refuses a name that can't stand in a key, and so none that can't be a folder's
     folder = RunFolder.of(run)
@@ -126,16 +136,24 @@ def prepare(config: DeployConfig) -> tuple[str, RunFolder, Path]:
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
     check_ports(config)
-    config = shared_out(config)
-    folder.create()
     # A new endpoint each time unless one was asked for: the old one may be taken.
-    sections: dict[str, Any] = service_sections(
-        config, run, config.endpoint or free_endpoint(), str(folder.root)
-    )
+    link = way_to_hub(config, config.endpoint or free_endpoint())
+    with folder.held_by("deploy.local"):
+        folder.check_free_of("learner")  # one started by hand, or one that an earlier run has left to finish
+        write(config, run, folder, link.endpoint)
+        yield run, folder, folder.config
+
+
+def write(config: DeployConfig, run: str, folder: RunFolder, endpoint: str) -> None:
+    """Make a run's folder with the settings of every process.
+
+    What each actor gets is theirs alone: a run that goes on with more of them shares out anew.
+    """
+    folder.create()
+    sections: dict[str, Any] = service_sections(shared_out(config), run, endpoint, str(folder.root))
     local = config.model_dump(mode="json", by_alias=True, exclude={"resume"}) | {"run": run}
-    folder.config.write_text(tomli_w.dumps({"local": local} | sections))
+    record(folder.config, {"local": local} | sections)
     folder.point_latest_here()
-    return run, folder, folder.config
 
 
 def check_ports(config: DeployConfig) -> None:
@@ -169,13 +187,28 @@ def outcome(run: str, folder: RunFolder, learner: Status | None) -> dict[str, An
     }
 
 
+def last_epoch(folder: RunFolder) -> dict[str, str]:
+    """Return the last row of a run's metrics.csv; {} before anything is trained."""
+    if not folder.metrics.exists():
+        return {}
+    with folder.metrics.open(newline="") as file:
+        # a learner that was killed may have left half a line at the end
+        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+    return rows[-1] if rows else {}
+
+
 def trained_seconds(folder: RunFolder) -> float:
     """Return the time from the first trained batch to the last, through restarts [s]."""
-    if not folder.metrics.exists():
-        return 0.0
-    with folder.metrics.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return round(float(rows[-1]["seconds"]), 1) if rows else 0.0
+    return round(float(last_epoch(folder).get("seconds", 0.0)), 1)
+
+
+def spent(config: DeployConfig, folder: RunFolder) -> str:
+    """Return the limit that a run had reached before, such as "10 of 10 minutes", or ""."""
+    last = last_epoch(folder)
+    if not (config.resume and last):
+        return ""
+    budget = Budget(config.learner.curriculum.epochs, config.frames, config.minutes)
+    return budget.spent(int(last["epoch"]), int(last["frames"]), float(last["seconds"]), ENDING_S)
 
 
 def final_measures(folder: RunFolder, config: DeployConfig, stop: Event) -> dict[str, Any]:
@@ -300,14 +333,23 @@ def end(family: Family, stop: Event) -> None:
 
 def run(config: DeployConfig, stop: Event) -> int:
     """Run it all; return the exit status: 0 only if the learner did its work."""
-    name, folder, config_file = prepare(config)
+    with prepared(config) as (name, folder, config_file):
+        return run_prepared(config, name, folder, config_file, stop)
+
+
+def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file: Path, stop: Event) -> int:
+    """Run what `prepared` gave; return the exit status."""
     set_up_logging("info", "deploy", folder.logs / LOG_FILE)
     endpoint = load_endpoint(config_file)
     log.info("run=%s folder=%s endpoint=%s actors=%d", name, folder.root, endpoint, config.actors)
+    if done := spent(config, folder):
+        log.warning(
+            NOTHING_LEFT, done, "learner."
+        )  # and so the learner ends at once, and its policy is measured
     view = View(name, minutes=config.minutes, frames=config.frames)
     family = Family(specs(config, config_file), folder.logs)
     try:
-        transport = connect(endpoint, stop, family)
+        transport = connect(way_to_hub(config, endpoint), stop, family)
         if transport is not None:
             with closing(transport):
                 watcher = Watcher(view, transport)
@@ -332,11 +374,11 @@ def run(config: DeployConfig, stop: Event) -> int:
     return DONE
 
 
-def connect(endpoint: str, stop: Event, family: Family) -> Transport | None:
+def connect(link: ZenohConfig, stop: Event, family: Family) -> Transport | None:
     """Return a connection to the learner, or None if it ended, or a stop was asked for, before it listened."""
     ended = _Ended(stop, family)
     try:
-        return open_zenoh(ZenohConfig(endpoint=endpoint, connect_timeout_s=CONNECT_S), ended)
+        return open_zenoh(link, ended)
     except TransportError:
         if ended.is_set():
             return None
@@ -345,7 +387,7 @@ def connect(endpoint: str, stop: Event, family: Family) -> Transport | None:
 
 def load_endpoint(config_file: Path) -> str:
     """Return the endpoint that the run's configuration names."""
-    found: str = tomllib.loads(config_file.read_text())["learner"]["endpoint"]
+    found: str = read_toml(config_file)["learner"]["endpoint"]
     return found
 
 

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from common.config import ENVIRONMENT_PREFIX
 from common.process import BAD_CONFIG
 from deploy.child import SPARE, Assignment
 
@@ -146,7 +147,11 @@ class Family:
 def _launch(arguments: Sequence[str], log_file: Path) -> subprocess.Popen[bytes]:
     with log_file.open("ab") as output:
         # One thread each: with more, numerics libraries on every process fight for the same cores.
-        environment = os.environ | {
+        # And no settings but those that the run has written down: all of them are in its config.toml.
+        environment = {
+            name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT_PREFIX)
+        }
+        environment |= {
             "OMP_NUM_THREADS": "1",
             "OPENBLAS_NUM_THREADS": "1",
             "MKL_NUM_THREADS": "1",

@@ -1,21 +1,40 @@
 """Run the learner: `python -m services.learner`."""
 
 import sys
+from collections.abc import Sequence
 from threading import Event
 
+from common.comms.keys import Keys
 from common.config import load
 from common.connection import connected
 from common.process import DONE, run_service
+from common.run_folder import RunFolder
 from services.learner.config import LearnerConfig
 from services.learner.service import LearnerService
 
 PROG = "python -m services.learner"
 
 
+def settings(argv: Sequence[str]) -> LearnerConfig:
+    """Return the learner's settings; with --resume those of the run's config.toml, but for what is given now."""
+    config = load(LearnerConfig, argv, prog=PROG, section="learner")
+    file = RunFolder.of(config.run, config.folder).config
+    if not (config.resume and file.exists()):
+        return config
+    # Which run it is was given now: the file of a copied folder names the folder that it was copied from.
+    which = {"run": config.run} if not config.folder else {}
+    found = load(LearnerConfig, argv, prog=PROG, section="learner", recorded=file)
+    return found.model_copy(update={"folder": config.folder, **which})
+
+
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
-    config = load(LearnerConfig, sys.argv[1:], prog=PROG, section="learner")
-    with connected("learner", config, stop) as (transport, metrics):
+    config = settings(sys.argv[1:])
+    Keys(config.run)  # refuses a name that can't stand in a key before a folder is made of it
+    with (
+        RunFolder.of(config.run, config.folder).held_by("learner"),
+        connected("learner", config, stop) as (transport, metrics),
+    ):
         LearnerService(config, transport, metrics).run(stop)
     return DONE
 

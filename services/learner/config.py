@@ -32,10 +32,12 @@ class LearnerConfig(ServiceConfig):
     minutes: float = Field(
         0.0,
         ge=0,
-        description="stop this long after the first trained batch; 0: no limit",
+        description="stop this long after the first trained batch, counted through restarts; 0: no limit",
         json_schema_extra={"unit": "min"},
     )
-    frames: int = Field(0, ge=0, description="stop after this many trained frames; 0: no limit")
+    frames: int = Field(
+        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
+    )
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}
     )

@@ -22,7 +22,7 @@ from common.comms.messages import (
     Status,
 )
 from common.comms.transport import Flow, Transport
-from common.config import to_toml
+from common.config import record, to_table
 from common.env.robot import home_action
 from common.errors import ReportedError
 from common.metrics import Metrics
@@ -32,6 +32,7 @@ from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
 from services.learner import checkpoint
+from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.guard import NOT_FINITE
 from services.learner.intake import Intake
@@ -93,8 +94,9 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         self._folder.create()
-        if not self._folder.config.exists():
-            self._folder.config.write_text(to_toml(config, "learner"))
+        # As they now stand; --resume says how this life began, and is no setting of the run.
+        settings = to_table(config.model_copy(update={"resume": False}))
+        record(self._folder.config, {"learner": settings})
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
             config.ppo,
@@ -129,6 +131,8 @@ class LearnerService:
         self._blob = self._average = b""
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         self.state = "waiting"
+        # Or one that waits for its first actor would have been without a checkpoint since 1970.
+        metrics.set("topspin_checkpoint_time_seconds", time.time())
         self._publish_policy()
         self._transport.publish(keys.stage(), encode(self._stages[-1]), Flow.STAGE)
 
@@ -143,14 +147,15 @@ class LearnerService:
     @property
     def done(self) -> bool:
         """Whether the budget is spent, or a stop was asked for."""
-        config, progress, clocks = self._config, self.training.progress, self._clocks
+        clocks = self._clocks
         spent_s = self._clock() - clocks.first_trained if clocks.first_trained >= 0 else 0.0
-        return (
-            self._stopping
-            or progress.epoch >= config.curriculum.epochs
-            or 0 < config.frames <= progress.frames
-            or 0 < config.minutes * 60.0 <= spent_s + clocks.resumed_seconds
-        )
+        return self._stopping or bool(self._spent(spent_s + clocks.resumed_seconds))
+
+    def _spent(self, seconds: float, slack_s: float = 0.0) -> str:
+        """Return the limit that is reached after so many seconds of training, or ""."""
+        config, progress = self._config, self.training.progress
+        budget = Budget(config.curriculum.epochs, config.frames, config.minutes)
+        return budget.spent(progress.epoch, progress.frames, seconds, slack_s)
 
     def ledger(self) -> Ledger:
         """Return the account of all actors together."""
@@ -170,6 +175,9 @@ class LearnerService:
             config.curriculum.epochs,
             *(config.run, config.endpoint) * 2,
         )
+        if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
+            log.warning(NOTHING_LEFT, spent, "")
+            self._stopping = True
         try:
             while not stop.is_set() and not self.done:
                 wait = self.step()

@@ -3,6 +3,7 @@
 import logging
 import shutil
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -68,6 +69,14 @@ def test_an_actor_that_comes_late_gets_policy_and_stage_and_takes_part(tmp_path)
     assert learner.service.ledger().balance == 0
 
 
+def test_a_learner_that_waits_for_its_first_actor_has_not_been_without_a_checkpoint_since_1970(tmp_path):
+    started = time.time()
+    with stage(tmp_path) as s:
+        waiting = s.learner(run=False).metric("topspin_checkpoint_time_seconds")
+
+    assert started <= waiting <= time.time()
+
+
 def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_path):
     with stage(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
@@ -127,6 +136,28 @@ def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp
     assert all(count.balance == 0 and count.in_flight == 0 for count in counts)
     assert set(ledger.refused) <= {VerdictKind.WRONG_GENERATION}
     assert min(reconnects) >= 1
+
+
+@pytest.mark.parametrize(
+    ("budget", "spent"), [({"frames": 2048}, "2,048 of 2,048 frames"), ({"minutes": 0.02}, "of 0.02 minutes")]
+)
+def test_a_learner_that_goes_on_with_its_budget_spent_says_so_and_trains_nothing(
+    tmp_path, caplog, budget, spent
+):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner(**budget)
+        s.generator()
+        actors = [s.actor(0), s.actor(1)]
+        learner.join(60)
+        s.take_down(learner)
+        again = s.learner(resume=True, **budget)
+        again.join(30)
+        for actor in actors:
+            actor.end()
+        trained = progress(learner).epoch, progress(again).epoch
+
+    assert trained[0] == trained[1] > 0
+    assert f"{spent} are trained, through all restarts; give --minutes or --frames more" in caplog.text
 
 
 def test_a_second_run_does_not_overwrite_the_first_ones_checkpoints(tmp_path):

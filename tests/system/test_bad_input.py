@@ -7,7 +7,7 @@ import pytest
 
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from tests.system.commands import run, running, wait_until
+from tests.system.commands import TINY, run, running, wait_until
 
 DEPLOY, LEARNER, ACTOR, EVALUATOR = (
     "deploy.local",
@@ -129,6 +129,37 @@ def test_a_run_is_not_begun_again_by_accident(tmp_path):
     status, line = one_line(tmp_path, DEPLOY, "--run", "r")
     assert status == 2
     assert "run 'r' exists already in runs/r: go on with --resume, or choose another --run" in line
+
+
+def test_a_run_started_service_by_service_is_not_resumed_as_a_whole(tmp_path):
+    config = tmp_path / "runs" / "r" / "config.toml"
+    config.parent.mkdir(parents=True)
+    config.write_text("[learner]\nseed = 3\n")
+
+    status, line = one_line(tmp_path, DEPLOY, "--run", "r", "--resume", "--panel", "off")
+
+    assert status == 2
+    assert "config.toml has no table [local]; go on with: python -m services.learner --run r --resume" in line
+    assert config.read_text() == "[learner]\nseed = 3\n"
+
+
+def test_a_run_that_is_alive_is_not_begun_or_resumed_beside_itself(tmp_path):
+    folder = tmp_path / "runs" / "r"
+    with running(tmp_path, DEPLOY, "--run", "r", *TINY) as first:
+        wait_until(lambda: list((folder / "checkpoints").glob("*.safetensors")), 90, "a checkpoint")
+        wait_until((folder / "policy" / "latest").exists, 30, "a policy")
+        config = (folder / "config.toml").read_text()
+        whole = one_line(tmp_path, DEPLOY, "--run", "r", "--resume", "--panel", "off")
+        alone = one_line(tmp_path, LEARNER, "--run", "r", "--resume", "--endpoint", "tcp/127.0.0.1:17482")
+        first.process.terminate()
+        first.wait(60)
+
+    assert whole[1].startswith(
+        f"python -m deploy.local: run 'r' is alive: deploy.local, process {first.process.pid}, is at work"
+    )
+    assert re.search(r"run 'r' is alive: learner, process \d+, is at work in runs/r; end it first", alone[1])
+    assert (whole[0], alone[0]) == (1, 1)
+    assert (folder / "config.toml").read_text() == config
 
 
 def test_an_actor_at_a_hub_without_a_learner_says_whom_it_waits_for_and_ends_when_asked(tmp_path):

@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import time
+import tomllib
 
 import pytest
 
@@ -133,9 +134,8 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
             wait_until(lambda: len(rows(tmp_path)) >= 20, 90, "training")
             first.process.kill()
         frames = int(rows(tmp_path)[-1]["frames"])
-        with running(
-            tmp_path, "services.learner", *learner, "--resume", "--frames", frames + 30_000
-        ) as second:
+        resume = ("--run", "r", "--resume", "--frames", frames + 30_000)  # all else stands in config.toml
+        with running(tmp_path, "services.learner", *resume) as second:
             status, _, err = second.wait(60)
         actor.process.send_signal(signal.SIGTERM)
         actor_status, _, actor_err = actor.wait(30)
@@ -143,6 +143,8 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
 
     assert status == 0, err
     assert "resumed file=runs/r/checkpoints/" in err
+    recorded = tomllib.loads((tmp_path / "runs" / "r" / "config.toml").read_text())["learner"]
+    assert (recorded["frames"], recorded["seed"], recorded["resume"]) == (frames + 30_000, 1, False)
     assert actor_status == 0, actor_err
     assert "Traceback" not in actor_err
     assert len(set(re.findall(r"policy received generation=(\d+)", actor_err))) == 2

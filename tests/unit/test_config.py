@@ -1,9 +1,10 @@
+import tomllib
 from typing import Literal
 
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.config import ConfigError, HelpRequest, load, to_toml
+from common.config import ConfigError, HelpRequest, load, record, to_table
 
 
 class Frozen(BaseModel):
@@ -164,7 +165,31 @@ def test_help_shows_unit_range_and_default_of_every_setting():
     assert "TOPSPIN_RUN" in text
 
 
-def test_a_written_file_is_read_back_as_it_was(toml):
+def test_a_written_file_is_read_back_as_it_was(tmp_path):
     settings = Learner(max_lag=1, resume=True, ppo=PPO(rates=(0.1, 0.2)))
+    record(tmp_path / "settings.toml", {"learner": to_table(settings)})
 
-    assert load_learner(file=toml(to_toml(settings, "learner"))) == settings
+    assert load_learner(file=str(tmp_path / "settings.toml")) == settings
+
+
+def test_recording_one_services_settings_leaves_the_others_as_they_were(tmp_path):
+    file = tmp_path / "settings.toml"
+    record(file, {"learner": {"max_lag": 1, "limit": 2.0}, "actor": {"envs": 3}})
+    record(file, {"learner": {"max_lag": 4}})
+
+    assert tomllib.loads(file.read_text()) == {"learner": {"max_lag": 4}, "actor": {"envs": 3}}
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_what_a_run_has_recorded_gives_way_to_flags_and_variables_and_a_file_that_is_named(toml, tmp_path):
+    recorded = tmp_path / "recorded.toml"
+    record(recorded, {"learner": {"max_lag": 3, "stage": 3}})
+    named = toml("[learner]\nmax_lag = 4")
+
+    def found(*argv, **environ):
+        settings = load(Learner, argv, prog="p", section="learner", environ=environ, recorded=recorded)
+        return settings.max_lag, settings.stage
+
+    assert found() == found(TOPSPIN_CONFIG=named) == (3, 3)
+    assert found("--max-lag", "5") == found(TOPSPIN_LEARNER__MAX_LAG="5") == (5, 3)
+    assert found("--config", named) == (4, 1)

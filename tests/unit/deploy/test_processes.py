@@ -4,11 +4,12 @@ import time
 
 import pytest
 
-from common.config import ConfigError
+from common.config import ConfigError, record
 from common.process import BAD_CONFIG
+from common.run_folder import RunFolder
 from deploy.child import Assignment
-from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out
-from deploy.local import check_ports, metrics_ports, prepare, settings, specs
+from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out, way_to_hub
+from deploy.local import check_ports, metrics_ports, prepared, settings, specs, spent
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
@@ -58,10 +59,12 @@ def test_a_run_is_resumed_from_its_checkpoints_and_begun_anew_without_any(tmp_pa
 
 
 def test_all_sections_agree_on_task_run_and_shards():
-    config = DeployConfig(actors=3, launch="strong", env={"noise": "hard", "flight": "full"})
+    config = DeployConfig(
+        actors=3, launch="strong", env={"noise": "hard", "flight": "full"}, tls_ca="certs/ca.pem"
+    )
     sections = service_sections(config, "r", "tcp/127.0.0.1:1", "runs/r")
 
-    for name in ("run", "endpoint", "seed", "launch"):
+    for name in ("run", "endpoint", "tls_ca", "seed", "launch"):
         assert len({str(section[name]) for section in sections.values()}) == 1, name
     assert sections["learner"]["env"] == sections["actor"]["env"] == sections["evaluator"]["env"]
     assert sections["learner"]["network"] == sections["actor"]["network"]
@@ -88,6 +91,9 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         minutes=5,
         frames=6,
         launch="strong",
+        tls_ca="ca.pem",
+        tls_certificate="hub.pem",
+        tls_key="hub.key",
         env={"noise": "hard", "flight": "full"},
         network={"units": (8, 4)},
     )
@@ -96,10 +102,11 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         for config, words in ((DeployConfig(), ("r", "e", "f")), (changed, ("s", "d", "g")))
     )
     by_the_process = {"id", "index"}  # on its command line
+    to_all = {"run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed"}
     for role, names in HANDED_DOWN.items():
         differing = {name for name in usual[role] if usual[role][name] != other[role][name]}
         constant = {"mode"} & set(names)
-        assert differing | constant == (set(names) - by_the_process) | {"run", "endpoint", "seed"}, role
+        assert differing | constant == (set(names) - by_the_process) | to_all, role
 
 
 @pytest.mark.parametrize(
@@ -112,6 +119,7 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         ("--generator.of", "give --generators"),
         ("--evaluator.network.units", "give --network.units"),
         ("--actor.index", "the run sets it"),
+        ("--actor.tls-key", "give --tls-key"),
     ],
 )
 def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
@@ -120,8 +128,41 @@ def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
 
 
 @pytest.mark.parametrize(
+    ("variable", "instead"),
+    [
+        ("TOPSPIN_LEARNER__PPO__CLIP", "set TOPSPIN_LOCAL__LEARNER__PPO__CLIP$"),
+        ("TOPSPIN_LEARNER__ENV__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_LOCAL__LEARNER__ENV__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_GENERATOR__NOISE", "set TOPSPIN_LOCAL__ENV__NOISE$"),
+        ("TOPSPIN_ACTOR__INDEX", "the run sets it$"),
+    ],
+)
+def test_a_variable_that_no_service_of_a_run_would_hear_of_is_refused(monkeypatch, variable, instead):
+    monkeypatch.setenv(variable, "1")
+
+    with pytest.raises(ConfigError, match=f"^{variable} would set nothing here: {instead}"):
+        settings([])
+
+
+def test_variables_of_a_run_reach_its_services_by_its_settings(monkeypatch):
+    monkeypatch.setenv("TOPSPIN_LOCAL__LEARNER__PPO__CLIP", "0.1")
+    monkeypatch.setenv("TOPSPIN_PLAY__RALLIES", "7")
+
+    assert service_sections(settings([]), "r", "e", "f")["learner"]["ppo"]["clip"] == 0.1
+    monkeypatch.setenv("TOPSPIN_LEARNER__PPO__CLAP", "0.1")
+    with pytest.raises(ConfigError, match="CLAP; did you mean 'TOPSPIN_LOCAL__LEARNER__PPO__CLIP'"):
+        settings([])
+
+
+@pytest.mark.parametrize(
     ("flags", "expected"),
-    [(("--actor.envs", "64"), (64, 2)), (("--learner.intake.dataset-rollouts", "3"), (128, 3))],
+    [
+        (("--actor.envs", "64"), (64, 2)),
+        (("--actor.envs", "256"), (256, 2)),
+        (("--learner.intake.dataset-rollouts", "3"), (128, 3)),
+        (("--learner.intake.dataset-rollouts", "1"), (128, 1)),
+        (("--actor.envs", "0", "--learner.intake.dataset-rollouts", "0"), (128, 2)),
+    ],
 )
 def test_environments_and_rollouts_that_were_asked_for_stay(flags, expected):
     config = shared_out(settings(["--run", "r", "--actors", "2", *flags]))
@@ -133,15 +174,110 @@ def test_environments_and_rollouts_that_were_asked_for_stay(flags, expected):
 def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_given_now(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = settings(["--run", "r", "--actors", "5", "--network.units", "8,4", "--evaluator.rallies", "33"])
-    prepare(first)
+    with prepared(first):
+        pass
 
     again = settings(["--run", "r", "--resume", "--minutes", "3"])
     newest = settings(["--run", "latest", "--resume"])
 
-    assert again == shared_out(first).model_copy(update={"resume": True, "minutes": 3.0})
-    assert shared_out(again) == again
-    assert again.actor.envs == 51
+    assert again == first.model_copy(update={"resume": True, "minutes": 3.0})
     assert newest.run == "r"
+
+
+def dealt(config):
+    """Return what each actor and the learner are told."""
+    sections = service_sections(shared_out(config), "r", "tcp/127.0.0.1:1", "runs/r")
+    return sections["actor"]["envs"], sections["learner"]["intake"]["dataset_rollouts"]
+
+
+@pytest.mark.parametrize(
+    ("begun", "resumed", "expected"),
+    [
+        ((), ("--actors", "8"), (32, 8)),
+        ((), ("--actors", "2", "--actor.envs", "256"), (256, 2)),
+        (("--actor.envs", "256"), ("--actors", "8"), (256, 8)),
+        (("--actor.envs", "256"), (), (256, 2)),
+        (("--learner.intake.dataset-rollouts", "3"), ("--actors", "4"), (64, 3)),
+    ],
+)
+def test_a_run_that_goes_on_with_other_actors_shares_out_anew_what_nobody_asked_for(
+    tmp_path, monkeypatch, begun, resumed, expected
+):
+    monkeypatch.chdir(tmp_path)
+    with prepared(settings(["--run", "r", "--actors", "2", *begun])):
+        pass
+
+    assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
+
+
+@pytest.mark.parametrize(
+    ("recorded", "resumed", "expected"),
+    [
+        ((1, 256, 1), (), (256, 1)),
+        ((1, 256, 1), ("--actors", "2"), (128, 2)),
+        ((1, 256, 1), ("--actors", "2", "--actor.envs", "256"), (256, 2)),
+        ((2, 128, 2), ("--actors", "8"), (32, 8)),
+        ((2, 64, 2), (), (64, 2)),
+        ((2, 64, 2), ("--actors", "4"), (64, 2)),
+    ],
+)
+def test_a_record_of_what_each_actor_got_is_taken_for_nobody_having_asked(
+    tmp_path, monkeypatch, recorded, resumed, expected
+):
+    monkeypatch.chdir(tmp_path)
+    actors, envs, rollouts = recorded
+    local = {"actors": actors, "actor": {"envs": envs}, "learner": {"intake": {"dataset_rollouts": rollouts}}}
+    (tmp_path / "runs" / "r").mkdir(parents=True)
+    record(RunFolder.of("r").config, {"local": local})
+
+    assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
+
+
+TLS = ("--tls-ca", "ca.pem", "--tls-certificate", "hub.pem", "--tls-key", "hub.key")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--endpoint", "foo"), r"local.endpoint = 'foo' \(--endpoint\); allowed: text, matching .*tcp\|tls"),
+        (("--endpoint", "tls/site:7447"), "allowed: all three with tls/..., none without"),
+        (("--endpoint", "tls/site:7447", *TLS[:4]), "allowed: all three with tls/..., none without"),
+        (TLS, "allowed: all three with tls/..., none without"),
+    ],
+)
+def test_an_endpoint_that_nobody_could_reach_is_refused_before_anything_is_written(
+    tmp_path, monkeypatch, flags, message
+):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=message), prepared(settings(["--run", "r", *flags])):
+        pass
+
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_run_itself_gets_to_the_hub_with_the_certificates_of_its_services():
+    config = settings(["--endpoint", "tls/site:7447", *TLS])
+
+    link = way_to_hub(config, config.endpoint)
+
+    assert (link.endpoint, link.tls_ca, link.tls_certificate, link.tls_key) == (
+        *("tls/site:7447", "ca.pem", "hub.pem", "hub.key"),
+    )
+
+
+def test_a_resumed_run_whose_budget_is_spent_is_told_what_is(tmp_path):
+    folder = RunFolder(tmp_path)
+    folder.metrics.write_text(
+        "epoch,frames,seconds\n1,8192,1.5\n900,7372800,599.8\n901,73"
+    )  # killed in a line
+    resumed = CONFIG.model_copy(update={"resume": True, "minutes": 10.0})
+
+    assert spent(resumed, folder) == "10 of 10 minutes"
+    assert spent(resumed.model_copy(update={"minutes": 0.0}), folder) == ""
+    assert spent(resumed.model_copy(update={"minutes": 20.0, "frames": 7_000_000}), folder) == (
+        "7,372,800 of 7,000,000 frames"
+    )
+    assert spent(resumed, RunFolder(tmp_path / "nothing")) == ""
 
 
 def test_a_free_port_passes_the_check():
@@ -187,6 +323,19 @@ def test_a_process_that_dies_is_started_again_and_its_log_goes_on(tmp_path, serv
     assert alive
     assert child.exits == [-signal.SIGKILL]
     assert child.process.poll() is not None
+
+
+def test_a_process_gets_the_environment_but_no_settings_from_it(tmp_path, service, monkeypatch):
+    (tmp_path / "stand_in.py").write_text(
+        "import os\nprint('heard', os.environ.get('TOPSPIN_CONFIG'), os.environ.get('ELSE'), flush=True)\n"
+    )
+    monkeypatch.setenv("TOPSPIN_CONFIG", "other.toml")
+    monkeypatch.setenv("ELSE", "kept")
+    family = kept(tmp_path, service)
+    wait_until(lambda: family.status_of("worker-0") is not None)
+    family.stop(["worker-0"], 1.0)
+
+    assert family.last_line("worker-0") == "heard None kept"
 
 
 def test_a_process_that_cannot_use_its_settings_is_not_started_again(tmp_path, service):
