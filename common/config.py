@@ -76,6 +76,7 @@ def load(
     section: str,
     environ: Mapping[str, str] | None = None,
     elsewhere: Callable[[Iterable[str]], Mapping[str, str]] = lambda _: {},
+    set_by: str = "the run",
     recorded: Path | None = None,
 ) -> _Model:
     """Return the settings of one service.
@@ -87,6 +88,7 @@ def load(
         section: The service's table in the file and its part of the environment's names.
         environ: Environment; the process's by default.
         elsewhere: Of all dotted paths, those that are no flags, and which flag to give instead ("": none).
+        set_by: Who sets those for which there is none.
         recorded: What a run that goes on has begun with: its file, unless ``--config`` names one. A file that the
             environment names for whatever is started doesn't take its place.
 
@@ -96,8 +98,9 @@ def load(
     """
     environ = os.environ if environ is None else environ
     settings = settings_of(model)
-    flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings))
-    environment = _read_environment(environ, settings, section, elsewhere(settings))
+    not_here = elsewhere(settings)
+    flags, file = _read_flags(argv, model, settings, prog, section, not_here, set_by)
+    environment = _read_environment(environ, settings, section, not_here, set_by)
     file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
     layers = (
         flags,
@@ -170,6 +173,7 @@ def _read_flags(
     prog: str,
     section: str,
     elsewhere: Mapping[str, str],
+    set_by: str,
 ) -> tuple[_Layer, str]:
     """Return what the flags set, and the file they name."""
     settings = {path: setting for path, setting in settings.items() if path not in elsewhere}
@@ -185,8 +189,8 @@ def _read_flags(
         path = name.replace("-", "_")
         setting = settings.get(path)
         if path in elsewhere:
-            instead = f"give --{flag_of(elsewhere[path])}" if elsewhere[path] else "the run sets it"
-            raise ConfigError(f"--{name} can't be set for one service: {instead}")
+            instead = f"give --{flag_of(elsewhere[path])}" if elsewhere[path] else f"{set_by} sets it"
+            raise ConfigError(f"--{name} can't be set here: {instead}")
         if setting is None and path != "config":
             flags = [f"--{flag_of(known)}" for known in settings]
             raise ConfigError(f"unknown flag --{name}{_suggestion(f'--{name}', flags)}")
@@ -206,7 +210,11 @@ _BOOLEANS: Final = ("true", "false", "yes", "no", "on", "off", "1", "0")
 
 
 def _read_environment(
-    environ: Mapping[str, str], settings: Mapping[str, Setting], section: str, elsewhere: Mapping[str, str]
+    environ: Mapping[str, str],
+    settings: Mapping[str, Setting],
+    section: str,
+    elsewhere: Mapping[str, str],
+    set_by: str,
 ) -> _Layer:
     layer = _Layer()
     names = {_variable(path, section): path for path in settings}
@@ -227,7 +235,7 @@ def _read_environment(
         path = names.get(ours) or shared.get(ours)
         if path is not None and (path in elsewhere or ours != variable):
             instead = elsewhere.get(path, path)
-            what = f"set {_variable(instead, section)}" if instead else "the run sets it"
+            what = f"set {_variable(instead, section)}" if instead else f"{set_by} sets it"
             raise ConfigError(f"{variable} would set nothing here: {what}")
         if path is not None:
             layer.put(path, settings[path].parse(environ[variable]), variable)

@@ -342,10 +342,8 @@ def run_prepared(config: DeployConfig, name: str, folder: RunFolder, config_file
     set_up_logging("info", "deploy", folder.logs / LOG_FILE)
     endpoint = load_endpoint(config_file)
     log.info("run=%s folder=%s endpoint=%s actors=%d", name, folder.root, endpoint, config.actors)
-    if done := spent(config, folder):
-        log.warning(
-            NOTHING_LEFT, done, "learner."
-        )  # and so the learner ends at once, and its policy is measured
+    if done := spent(config, folder):  # and so the learner ends at once, and its policy is measured
+        log.warning(NOTHING_LEFT, done, "learner.")
     view = View(name, minutes=config.minutes, frames=config.frames)
     family = Family(specs(config, config_file), folder.logs)
     try:

@@ -51,7 +51,7 @@ class _Table:
 
     def __init__(self, count: int, stage: int, launch: str, settings: dict[str, Any]) -> None:
         self._count, self._stage, self._launch = count, stage, launch
-        given = EnvConfig(**(DEFAULTS | settings))
+        given = EnvConfig(**{**DEFAULTS, **settings})
         seen = given.observation.model_copy(update={"critic": "policy"})
         # Nobody here is told what the last actions before a hit should have been
         self._config = given.model_copy(update={"observation": seen, "hindsight": False})

@@ -34,11 +34,25 @@ SUBCOMMANDS: Final[dict[str, Callable[[Sequence[str], Event], int]]] = {
 }
 
 
+def settings(argv: Sequence[str]) -> EvaluatorConfig:
+    """Return the evaluator's settings; with --policy the task is the contract's, and flags for it are refused."""
+    if any(word.partition("=")[0] == "--policy" for word in argv):
+        return load(
+            EvaluatorConfig,
+            argv,
+            prog=PROG,
+            section="evaluator",
+            elsewhere=once.given_elsewhere,
+            set_by=once.SET_BY,
+        )
+    return load(EvaluatorConfig, argv, prog=PROG, section="evaluator")
+
+
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop, or a command; return the exit status."""
     if len(sys.argv) > 1 and sys.argv[1] in SUBCOMMANDS:
         return SUBCOMMANDS[sys.argv[1]](sys.argv[2:], stop)
-    config = load(EvaluatorConfig, sys.argv[1:], prog=PROG, section="evaluator")
+    config = settings(sys.argv[1:])
     if config.policy:
         set_up_logging(config.log_level, "evaluator")
         folder = Path(config.policy)

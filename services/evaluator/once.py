@@ -3,16 +3,16 @@
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from threading import Event
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from common.env.rally_env import EnvConfig
 from common.errors import ReportedError
 from common.policy.weights import Contract, Policy
 from services.evaluator.breakdown import breakdown, survival, table
-from services.evaluator.match import environments, evaluation_rallies, play_match
+from services.evaluator.match import TRAINING_ONLY, environments, evaluation_rallies, play_match
 from services.evaluator.measures import measures
 
 
@@ -41,6 +41,28 @@ def check(stop: Event) -> None:
     """Raise StoppedError if a stop was asked for."""
     if stop.is_set():
         raise StoppedError("stopped before it was done")
+
+
+SET_BY: Final = (
+    "the policy's contract or the match"  # what `given_elsewhere` finds, and nothing else can be given for
+)
+CONTRACTS: Final = ("control_rate_hz", "robot", "flight", "observation")
+"""Settings of the task that are a policy's own."""
+
+
+def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
+    """Return those dotted paths of a command that measures a policy which set nothing, and what to give instead.
+
+    "": nothing, the contract has it, or no match has it, being for training alone.
+    """
+    found = {"env.noise": "noise", "env.rounds": "rounds", "env.observation.spin_expected": "spin_expected"}
+    owners = {f"env.{name}" for name in (*CONTRACTS, *TRAINING_ONLY, "reward")} | {"network"}
+    known = set(paths)
+    return {
+        path: instead if (instead := found.get(path, "")) in known else ""
+        for path in known
+        if path in found or path in owners or any(path.startswith(f"{owner}.") for owner in owners)
+    }
 
 
 def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:

@@ -54,7 +54,9 @@ def main(argv: Sequence[str], stop: Event) -> int:
     def breathe() -> None:
         once.check(stop)
 
-    config = load(PlayConfig, argv, prog=PROG, section="play")
+    config = load(
+        PlayConfig, argv, prog=PROG, section="play", elsewhere=once.given_elsewhere, set_by=once.SET_BY
+    )
     set_up_logging(config.log_level, "evaluator")
     started = time.monotonic()
     folder = policy_folder(config.policy)

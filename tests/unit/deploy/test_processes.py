@@ -123,7 +123,7 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
     ],
 )
 def test_what_a_run_hands_down_cant_be_set_for_one_service(flag, instead):
-    with pytest.raises(ConfigError, match=f"{flag} can't be set for one service: {instead}$"):
+    with pytest.raises(ConfigError, match=f"{flag} can't be set here: {instead}$"):
         settings([flag, "1"])
 
 
