@@ -28,7 +28,7 @@ from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
-from common.run_folder import LATEST, RUNS, RunFolder
+from common.run_folder import LATEST, LOCKS, RUNS, RunFolder
 from deploy.config import (
     DeployConfig,
     given_elsewhere,
@@ -135,6 +135,8 @@ def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
         raise ConfigError(
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
+    for holder in LOCKS:  # one that is alive has its ports, too, which would be the lesser news
+        folder.check_free_of(holder)
     check_ports(config)
     # A new endpoint each time unless one was asked for: the old one may be taken.
     link = way_to_hub(config, config.endpoint or free_endpoint())

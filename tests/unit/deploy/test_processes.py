@@ -1,12 +1,13 @@
 import os
 import signal
+import socket
 import time
 
 import pytest
 
 from common.config import ConfigError, record
 from common.process import BAD_CONFIG
-from common.run_folder import RunFolder
+from common.run_folder import RunAliveError, RunFolder
 from deploy.child import Assignment
 from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out, way_to_hub
 from deploy.local import check_ports, metrics_ports, prepared, settings, specs, spent
@@ -182,6 +183,23 @@ def test_a_resumed_run_has_the_settings_of_its_first_start_but_for_the_flags_giv
 
     assert again == first.model_copy(update={"resume": True, "minutes": 3.0})
     assert newest.run == "r"
+
+
+@pytest.mark.parametrize("holder", ["deploy.local", "learner"])
+def test_a_run_that_is_alive_is_refused_as_such_though_its_ports_are_taken_too(tmp_path, monkeypatch, holder):
+    monkeypatch.chdir(tmp_path)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        again = settings(["--run", "r", "--metrics-port", str(taken.getsockname()[1])])
+
+        with (
+            RunFolder.of("r").held_by(holder),
+            pytest.raises(RunAliveError, match=f"alive: {holder}, process"),
+        ):
+            prepared(again).__enter__()
+
+    assert not RunFolder.of("r").config.exists()
 
 
 def dealt(config):
