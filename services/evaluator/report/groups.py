@@ -43,11 +43,17 @@ SPINS: Final[Mapping[str, list[str]]] = {"hidden": [], "estimated": ["estimated 
 
 
 def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run that make the experiment, by dotted path."""
+    """Return the settings of a run that make the experiment, by dotted path.
+
+    What was asked of ``deploy.local`` for a service counts as it came to be, in the service's own table.
+    """
+    every = dict(leaves(settings))
     return {
         path: value
-        for path, value in leaves(settings)
-        if OBSERVER not in path.split(".")[:2] and path.split(".")[-1] not in BOOKKEEPING
+        for path, value in every.items()
+        if OBSERVER not in path.split(".")[:2]
+        and path.split(".")[-1] not in BOOKKEEPING
+        and not (path.startswith("local.") and path.removeprefix("local.") in every)
     }
 
 

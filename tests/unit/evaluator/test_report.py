@@ -154,6 +154,14 @@ def test_how_a_run_is_evaluated_makes_no_experiment():
     }
 
 
+def test_what_was_asked_for_a_service_counts_as_it_came_to_be():
+    """0: as many as share out; a file of earlier releases says what that was."""
+    asked = {"local": {"actor": {"envs": 0}}, "actor": {"envs": 256}}
+    written = {"local": {"actor": {"envs": 256}}, "actor": {"envs": 256}}
+
+    assert experiment(asked) == experiment(written) == {"actor.envs": 256}
+
+
 def test_groups_are_called_by_what_tells_them_apart():
     privileged = {"observation": {"critic": "privileged"}}
     usual = {"spin": "estimated", "prediction": True, "age": True}
