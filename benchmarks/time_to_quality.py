@@ -1,8 +1,8 @@
 """How long from nothing to the paper's figures? (`python -m benchmarks.time_to_quality --json`).
 
 Starts a real run with `deploy.local` and follows its evaluator's curve until a policy returns 81 % of 1,000 balls and
-lands 0.31 m from the target; the run's best policy is then measured on rallies that chose nobody. Flags after `--` go
-to `deploy.local`. Time is wall time from the start of the command: imports and start-up are in it.
+lands 0.31 m from the target; the run's best policy is then measured on rallies that it wasn't chosen by. Flags after
+`--` go to `deploy.local`. Time is wall time from the start of the command: imports and start-up are in it.
 """
 
 import argparse

@@ -89,8 +89,8 @@ def load(
         environ: Environment; the process's by default.
         elsewhere: Of all dotted paths, those that are no flags, and which flag to give instead ("": none).
         set_by: Who sets those for which there is none.
-        recorded: What a run that goes on has begun with: its file, unless ``--config`` names one. A file that the
-            environment names for whatever is started doesn't take its place.
+        recorded: What a run that goes on was last played with: its file, unless ``--config`` names one. A file that
+            the environment names for whatever is started doesn't take its place.
 
     Raises:
         ConfigError: An unknown or unusable setting.
@@ -108,10 +108,52 @@ def load(
         _read_file(file, settings, section) if file else _Layer(),
         _nested_defaults(settings),
     )
-    try:
-        return _merged(model, layers)
-    except ValidationError as error:
-        raise ConfigError(_first_line(error, settings, layers, section)) from error
+    return _checked(model, layers, settings, section)
+
+
+def first_look(
+    model: type[BaseModel],
+    names: Sequence[str],
+    argv: Sequence[str],
+    *,
+    prog: str,
+    section: str,
+    environ: Mapping[str, str] | None = None,
+    elsewhere: Callable[[Iterable[str]], Mapping[str, str]] = lambda _: {},
+) -> tuple[Any, frozenset[str]]:
+    """Return some settings, by which it is decided where the others come from, before those can be judged.
+
+    Args:
+        model: What there is to set.
+        names: Of the fields that are looked at, none of them a model.
+        argv: Flags, without the program's name.
+        prog: How the program is called, for the help text.
+        section: The service's table in the file and its part of the environment's names.
+        environ: Environment; the process's by default.
+        elsewhere: As for `load`.
+
+    Returns:
+        An object with these fields, and the dotted paths of all settings that flags and environment give.
+
+    Raises:
+        ConfigError: An unknown flag or variable, or one of these settings is unusable.
+        HelpRequest: ``--help`` is among the flags.
+    """
+    environ = os.environ if environ is None else environ
+    settings = settings_of(model)
+    flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings), "the run")
+    environment = _read_environment(environ, settings, section, elsewhere(settings), "the run")
+    file = file or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+    layers = [flags, environment, _read_file(file, settings, section) if file else _Layer()]
+    some = [
+        _Layer({name: layer.values[name] for name in names if name in layer.values}, layer.origins)
+        for layer in layers
+    ]
+    fields: dict[str, Any] = {
+        name: (model.model_fields[name].annotation, model.model_fields[name]) for name in names
+    }
+    looked_at = _checked(create_model("Some", **fields), some, settings, section)
+    return looked_at, frozenset(flags.origins | environment.origins)
 
 
 def to_table(model: BaseModel) -> dict[str, Any]:
@@ -139,6 +181,15 @@ def read_toml(file: Path) -> dict[str, Any]:
         raise ConfigError(f"can't read {file}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file} is not TOML: {error}") from error
+
+
+def _checked(
+    model: type[_Model], layers: Sequence[_Layer], settings: Mapping[str, Setting], section: str
+) -> _Model:
+    try:
+        return _merged(model, layers)
+    except ValidationError as error:
+        raise ConfigError(_first_line(error, settings, layers, section)) from error
 
 
 def _merged(model: type[_Model], layers: Sequence[_Layer]) -> _Model:

@@ -1,6 +1,8 @@
 """Where a run keeps its things, and who may write there."""
 
+import errno
 import fcntl
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,12 +12,16 @@ from typing import Final, Literal
 
 from common.errors import ReportedError
 
+log = logging.getLogger(__name__)
+
 RUNS = Path("runs")
 LATEST = "latest"
 
 Holder = Literal["learner", "deploy.local"]
-LOCKS: Final[dict[Holder, str]] = {"learner": ".lock", "deploy.local": ".deploy.lock"}
-"""What each writer of a run folder holds while it lives, the file's name. Two, since deploy.local starts a learner."""
+LOCKS: Final[dict[Holder, str]] = {"deploy.local": ".deploy.lock", "learner": ".lock"}
+"""What each writer of a run folder holds while it lives, the file's name. Two, since deploy.local starts a learner: who
+ends that alone ends it before its actors."""
+_NO_LOCKS: Final = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)  # a file system that has none
 
 
 class RunAliveError(ReportedError):
@@ -92,7 +98,7 @@ class RunFolder:
         """
         self.root.mkdir(parents=True, exist_ok=True)
         # Closed in whatever process we start: a lock lives as long as anybody has the file open.
-        file = os.open(self._lock(holder), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        file = self._open(holder, os.O_RDWR | os.O_CREAT)
         try:
             self._take(file, fcntl.LOCK_EX, holder)
             os.truncate(file, 0)
@@ -104,7 +110,7 @@ class RunFolder:
     def check_free_of(self, holder: Holder) -> None:
         """Raise RunAliveError if a ``holder`` is at work in the folder; nothing is written."""
         try:
-            file = os.open(self._lock(holder), os.O_RDONLY | os.O_CLOEXEC)
+            file = self._open(holder, os.O_RDONLY)
         except FileNotFoundError:
             return
         try:
@@ -115,6 +121,12 @@ class RunFolder:
     def _lock(self, holder: Holder) -> Path:
         return self.root / LOCKS[holder]
 
+    def _open(self, holder: Holder, how: int) -> int:
+        try:
+            return os.open(self._lock(holder), how | os.O_CLOEXEC, 0o644)
+        except PermissionError as error:
+            raise ReportedError(f"can't open {self._lock(holder)}: {error.strerror}") from None
+
     def _take(self, file: int, how: int, holder: Holder) -> None:
         try:
             fcntl.flock(file, how | fcntl.LOCK_NB)
@@ -124,6 +136,12 @@ class RunFolder:
                 f"run {self.root.name!r} is alive: {holder}, process {process}, is at work in {self.root}; "
                 "end it first, or choose another --run"
             ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            log.warning(
+                "can't be locked folder=%s reason=%s: see that nobody else runs it", self.root, error.strerror
+            )
 
     def point_latest_here(self) -> None:
         """Let runs/latest name this run."""

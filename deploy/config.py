@@ -1,6 +1,6 @@
 """Settings of a whole run on one machine: every process's, and how many there are."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -109,22 +109,27 @@ def shared_out(config: DeployConfig) -> DeployConfig:
     return _dealt(config, envs, {"dataset_rollouts": rollouts, "queue_rollouts": queue})
 
 
-def shared_again(config: DeployConfig, recorded: DeployConfig, given: DeployConfig) -> DeployConfig:
-    """Return a resumed run's settings, to be shared out anew if they were when it began.
+def shared_again(config: DeployConfig, recorded: DeployConfig, given: Set[str]) -> DeployConfig:
+    """Return a resumed run's settings, to be shared out anew where they were when it began.
 
-    Releases before this one wrote down what each actor got, not that nobody had asked for it: so both numbers being
+    Releases before this one wrote down what each actor got, not that nobody had asked for it: so a number that is
     what that many actors get is taken for it.
 
     Args:
         config: What the run goes on with.
         recorded: What its file says.
-        given: What flags and environment say.
+        given: Dotted paths of what flags and environment say.
     """
-    envs, rollouts = recorded.actor.envs, recorded.learner.intake.dataset_rollouts
     usual = shared_out(DeployConfig(actors=recorded.actors))
-    if (envs, rollouts) != (usual.actor.envs, usual.learner.intake.dataset_rollouts):
-        return config
-    return _dealt(config, given.actor.envs, {"dataset_rollouts": given.learner.intake.dataset_rollouts})
+    envs, rollouts = config.actor.envs, config.learner.intake.dataset_rollouts
+    if "actor.envs" not in given and recorded.actor.envs == usual.actor.envs:
+        envs = 0
+    if (
+        "learner.intake.dataset_rollouts" not in given
+        and recorded.learner.intake.dataset_rollouts == usual.learner.intake.dataset_rollouts
+    ):
+        rollouts = 0
+    return _dealt(config, envs, {"dataset_rollouts": rollouts})
 
 
 def _dealt(config: DeployConfig, envs: int, intake: Mapping[str, int]) -> DeployConfig:
@@ -136,16 +141,18 @@ def _dealt(config: DeployConfig, envs: int, intake: Mapping[str, int]) -> Deploy
 
 HANDED_DOWN: Final[Mapping[str, Mapping[str, str]]] = {
     "learner": {name: name for name in ("launch", "env", "network", "minutes", "frames", "folder", "mode")},
-    "actor": {name: name for name in ("launch", "env", "network", "shards", "id", "index")},
+    "actor": {name: name for name in ("launch", "env", "network", "shards")},
     "generator": {
         "launch": "launch", "noise": "env.noise", "flight": "env.flight", "shards": "shards", "of": "generators",
-        "id": "id", "index": "index",
     },
     "evaluator": {"launch": "launch", "env": "env", "network": "network", "noise": "env.noise", "folder": "folder"},
 }  # fmt: skip
-"""What a service is told by the run, and which of the run's settings says it; some, only the run knows. Id and index
-are on its command line."""
+"""What a service is told by the run, and which of the run's settings says it; some, only the run knows."""
 _TO_ALL: Final = ("run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed")
+ON_COMMAND_LINE: Final[Mapping[str, str]] = {
+    "id": "", "index": "", "metrics_port": "metrics_port", "resume": "resume", "policy": ""
+}  # fmt: skip
+"""What each process gets, or doesn't, when it is started, and the run's setting behind it ("": none)."""
 
 
 def way_to_hub(config: DeployConfig, endpoint: str) -> ZenohConfig:
@@ -172,7 +179,8 @@ def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
     for path in paths:
         role, _, rest = path.partition(".")
         name, _, inner = rest.partition(".")
-        source = name if name in _TO_ALL else HANDED_DOWN.get(role, {}).get(name)
+        to_all = {**{name: name for name in _TO_ALL}, **ON_COMMAND_LINE}
+        source = to_all.get(name, HANDED_DOWN.get(role, {}).get(name))
         if role in HANDED_DOWN and source is not None:
             known = source.partition(".")[0] in DeployConfig.model_fields
             found[path] = f"{source}.{inner}".rstrip(".") if known else ""

@@ -23,7 +23,7 @@ from common.comms.messages import Status
 from common.comms.transport import Transport, TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.config import ConfigError, load, read_toml, record
+from common.config import ConfigError, first_look, load, read_toml, record
 from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
@@ -103,15 +103,17 @@ def free_endpoint() -> str:
 
 def settings(argv: Sequence[str]) -> DeployConfig:
     """Return the settings of a run; a resumed one has those of its config.toml, but for the flags given now."""
-    config = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
-    if not config.resume:
-        if config.run == LATEST:
+    asked, given = first_look(
+        DeployConfig, ("run", "resume"), argv, prog=PROG, section="local", elsewhere=given_elsewhere
+    )
+    if not asked.resume:
+        if asked.run == LATEST:
             raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
-        return config
-    if not config.run:
+        return load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere)
+    if not asked.run:
         newest = f": the newest run is {os.readlink(RUNS / LATEST)}" if (RUNS / LATEST).is_symlink() else ""
         raise ConfigError(f"--resume needs --run NAME{newest}")
-    name = os.readlink(RUNS / LATEST) if config.run == LATEST else config.run
+    name = os.readlink(RUNS / LATEST) if asked.run == LATEST else asked.run
     file = RunFolder.of(name).config
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
@@ -122,28 +124,37 @@ def settings(argv: Sequence[str]) -> DeployConfig:
         )
     resumed = load(DeployConfig, argv, prog=PROG, section="local", elsewhere=given_elsewhere, recorded=file)
     before = load(DeployConfig, (), prog=PROG, section="local", environ={}, recorded=file)
-    return shared_again(resumed, before, config).model_copy(update={"run": name})
+    return shared_again(resumed, before, given).model_copy(update={"run": name})
 
 
 @contextmanager
 def prepared(config: DeployConfig) -> Iterator[tuple[str, RunFolder, Path]]:
-    """Yield name, folder and configuration file of a run, all of it written; nobody else can run it meanwhile."""
+    """Yield name, folder and configuration file of a run, all of it written; nobody else can run it meanwhile.
+
+    A run that goes on with settings that don't fit, and fails before it has trained anything, keeps its own.
+    """
     run = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
     Keys(run)  # refuses a name that can't stand in a key, and so none that can't be a folder's
     folder = RunFolder.of(run)
+    for holder in LOCKS:  # one that is alive exists, and has its ports: the lesser news
+        folder.check_free_of(holder)
     if folder.config.exists() and not config.resume:
         raise ConfigError(
             f"run {run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
-    for holder in LOCKS:  # one that is alive has its ports, too, which would be the lesser news
-        folder.check_free_of(holder)
     check_ports(config)
     # A new endpoint each time unless one was asked for: the old one may be taken.
     link = way_to_hub(config, config.endpoint or free_endpoint())
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one started by hand, or one that an earlier run has left to finish
+        before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
         write(config, run, folder, link.endpoint)
-        yield run, folder, folder.config
+        try:
+            yield run, folder, folder.config
+        except RunFailedError:
+            if before and last_epoch(folder) == trained:
+                record(folder.config, before)
+            raise
 
 
 def write(config: DeployConfig, run: str, folder: RunFolder, endpoint: str) -> None:
@@ -176,16 +187,14 @@ def outcome(run: str, folder: RunFolder, learner: Status | None) -> dict[str, An
     """Return where a run stands, from what it wrote; the account of its rollouts is the learner's last word."""
     contract = load_policy(folder.latest_policy).contract
     counters = learner.counters if learner else {}
+    fates = ("published", "trained", "refused", "dropped", "in_flight", "lost")
     return {
         "run": run,
         "policy": str(folder.latest_policy),
         "frames": contract.frames,
         "stage": contract.stage,
         "seconds": trained_seconds(folder),
-        "ledger": {
-            name: int(counters.get(name, 0))
-            for name in ("published", "trained", "refused", "dropped", "in_flight", "lost")
-        },
+        "ledger": {name: int(counters[name]) for name in fates if name in counters},
     }
 
 
@@ -195,7 +204,7 @@ def last_epoch(folder: RunFolder) -> dict[str, str]:
         return {}
     with folder.metrics.open(newline="") as file:
         # a learner that was killed may have left half a line at the end
-        rows = [row for row in csv.DictReader(file) if None not in row.values()]
+        rows = [row for row in csv.DictReader(file) if None not in row.values() and None not in row]
     return rows[-1] if rows else {}
 
 

@@ -49,7 +49,7 @@ _DV, _SPIN, _DRAG = 3, 6, 9
 # Columns of a track's row
 POS, VEL = 0, 3  # of the nominal ball at the last sample
 NOMINAL_SPIN, NOMINAL_DRAG = 6, 9  # w_0 [rad/s], drag factor
-MOMENT, BEGUN = 10, 11  # of the last sample, and of the fit's beginning, since launch [s]
+MOMENT, BEGUN = 10, 11  # of the last sample, and of the fit's beginning, on the samples' clock [s]
 WAY, PATH = 12, 15  # X' [m], X [m s]
 SLOWED, SLOWED_PATH = 18, 21  # D' [m/s], D [m]
 LEFT, LEFT_PATH = 24, 25  # E' [-], E [s]
@@ -135,7 +135,7 @@ def begin_track(
     Args:
         track: Written.
         seen: Position [m] and velocity [m/s], first six numbers.
-        moment: When it was taken, since launch [s].
+        moment: When it was taken, on whatever clock [s].
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
     """
@@ -465,7 +465,7 @@ def follow(
     Args:
         track: (TRACK,); written.
         seen: Position [m] and velocity [m/s], first six numbers.
-        moment: When it was taken, since launch [s]; no later than the last: nothing new.
+        moment: When it was taken, on the same clock [s]; no later than the last: nothing new.
         bounced: Whether it was taken behind the bounce.
         position_noise: Its sigma a axis [m].
         velocity_noise: [m/s].
@@ -479,7 +479,7 @@ def follow(
 
 @kernel
 def predict(track: Array, now: float) -> None:
-    """Write where the ball is ``now`` [s since launch], and how it will come to be met."""
+    """Write where the ball is ``now`` [s, on the samples' clock], and how it will come to be met."""
     pos, vel, spin, drag = _estimate(track)
     ahead = now - track[MOMENT]
     until = MEETING_AFTER - (track[MOMENT] - track[BEGUN])  # from the last sample to the meeting

@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Event
 from typing import Final
 
-from common.config import load
+from common.config import first_look, load
 from common.connection import connected
 from common.log import set_up_logging
 from common.policy.weights import load_policy
@@ -35,17 +35,12 @@ SUBCOMMANDS: Final[dict[str, Callable[[Sequence[str], Event], int]]] = {
 
 
 def settings(argv: Sequence[str]) -> EvaluatorConfig:
-    """Return the evaluator's settings; with --policy the task is the contract's, and flags for it are refused."""
-    if any(word.partition("=")[0] == "--policy" for word in argv):
-        return load(
-            EvaluatorConfig,
-            argv,
-            prog=PROG,
-            section="evaluator",
-            elsewhere=once.given_elsewhere,
-            set_by=once.SET_BY,
-        )
-    return load(EvaluatorConfig, argv, prog=PROG, section="evaluator")
+    """Return the evaluator's settings; with a policy the task is the contract's, and what would set it is refused."""
+    asked, _ = first_look(EvaluatorConfig, ("policy",), argv, prog=PROG, section="evaluator")
+    elsewhere = once.given_elsewhere if asked.policy else lambda _: {}
+    return load(
+        EvaluatorConfig, argv, prog=PROG, section="evaluator", elsewhere=elsewhere, set_by=once.SET_BY
+    )
 
 
 def main(stop: Event) -> int:

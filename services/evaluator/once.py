@@ -43,9 +43,7 @@ def check(stop: Event) -> None:
         raise StoppedError("stopped before it was done")
 
 
-SET_BY: Final = (
-    "the policy's contract or the match"  # what `given_elsewhere` finds, and nothing else can be given for
-)
+SET_BY: Final = "the policy's contract or the match"  # ... sets what `given_elsewhere` finds
 CONTRACTS: Final = ("control_rate_hz", "robot", "flight", "observation")
 """Settings of the task that are a policy's own."""
 

@@ -3,14 +3,17 @@
 import csv
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from threading import Event
 from typing import Any
+
+from pydantic import ValidationError
 
 from common.comms.codec import DecodeError, decode, decode_one_of, encode
 from common.comms.keys import Keys
 from common.comms.messages import AVERAGE, Command, Control, ControlReply, PolicySnapshot, Status
 from common.comms.transport import Flow, PendingReply, Reply, Transport
+from common.env.rally_env import EnvConfig
 from common.metrics import Metrics
 from common.policy.weights import (
     Contract,
@@ -66,7 +69,7 @@ def score(stage: int, found: dict[str, Any]) -> tuple[int, float]:
 
 
 def match_of(config: EvaluatorConfig) -> dict[str, Any]:
-    """Return what is played, as it stands beside a policy's measures."""
+    """Return what is played, as it stands with a policy's measures."""
     return {
         "rallies": config.rallies,
         "launch": config.launch,
@@ -75,17 +78,24 @@ def match_of(config: EvaluatorConfig) -> dict[str, Any]:
     }
 
 
+def _match_in(contract: Contract) -> dict[str, Any]:
+    """Return the match that a contract's measures are of; contracts of earlier releases say it in other places."""
+    rallies = contract.measures.get("rallies")
+    earlier = {"rallies": rallies, "launch": contract.launch, "noise": contract.noise, "rounds": 1}
+    found: dict[str, Any] = contract.measures.get("match", earlier)
+    return found
+
+
 def measured_alike(contract: Contract, config: EvaluatorConfig) -> bool:
     """Return whether a policy was measured as ``config`` asks for: as many balls of the same kind, in the same task."""
-    match = match_of(config)
-    # To a match, whose noise and rounds are its own
-    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}
-
-    def task(env: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: value for name, value in env.items() if name not in irrelevant}
-
-    theirs = {name: contract.measures.get(name) for name in match}
-    return theirs == match and task(contract.env) == task(config.env.model_dump(mode="json"))
+    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}  # a match has its own, or none
+    try:
+        theirs = EnvConfig.model_validate(contract.env)
+    except ValidationError:
+        return False
+    return _match_in(contract) == match_of(config) and (
+        theirs.model_dump(exclude=irrelevant) == config.env.model_dump(exclude=irrelevant)
+    )
 
 
 class EvaluatorService:
@@ -263,7 +273,7 @@ class EvaluatorService:
                 self._folder.best_policy,
                 policy.network,
                 policy.moments,
-                contract.model_copy(update={"measures": match_of(self._config) | found}),
+                contract.model_copy(update={"measures": found | {"match": match_of(self._config)}}),
             )
 
     def _contract(self, snapshot: PolicySnapshot) -> Contract:

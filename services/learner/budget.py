@@ -4,9 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-ENDING_S: Final = (
-    1.0  # a run that has less than this left has ended: its last dataset would have come too late
-)
+ENDING_S: Final = 1.0  # a run that has less left than this has ended: its last dataset came too late
 
 NOTHING_LEFT: Final = (
     "nothing is left to train: %s are trained, through all restarts; give --minutes or --frames more (0: no limit), "

@@ -92,6 +92,14 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(folder.glob(f"*{SUFFIX}"))
 
 
+def newest(folder: Path) -> Path:
+    """Return a run's newest checkpoint; raises CheckpointError where there is none."""
+    files = checkpoints(folder)
+    if not files:
+        raise CheckpointError(f"nothing to resume in {folder}: no checkpoint there; start without --resume")
+    return files[-1]
+
+
 def restore(path: Path, training: Training) -> Extras:
     """Load a checkpoint into ``training`` and return what the service kept.
 

@@ -94,9 +94,6 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         self._folder.create()
-        # As they now stand; --resume says how this life began, and is no setting of the run.
-        settings = to_table(config.model_copy(update={"resume": False}))
-        record(self._folder.config, {"learner": settings})
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
             config.ppo,
@@ -113,6 +110,9 @@ class LearnerService:
         self._stages: list[StageChange] = []
         self._clocks = Clocks(clock())
         memory = self._restore() if config.resume else ()
+        # As they now stand, once they have proved to fit; --resume says how this life began, and is none of the run.
+        settings = to_table(config.model_copy(update={"resume": False}))
+        record(self._folder.config, {"learner": settings})
         if not config.resume:
             self._record.truncate(0)  # of a life that ended before its first checkpoint
         self._intake = Intake(config.intake, self._standing(), memory)
@@ -311,12 +311,8 @@ class LearnerService:
         )
 
     def _restore(self) -> tuple[Remembered, ...]:
-        files = checkpoint.checkpoints(self._folder.checkpoints)
-        if not files:
-            raise checkpoint.CheckpointError(
-                f"nothing to resume in {self._folder.checkpoints}: no checkpoint there; start without --resume"
-            )
-        extras = checkpoint.restore(files[-1], self.training)
+        file = checkpoint.newest(self._folder.checkpoints)
+        extras = checkpoint.restore(file, self.training)
         # Actors may still hold policies of the learner before: theirs must not look newer than ours.
         self._generation = max(self._generation, extras.generation + 1)
         self._stages = [StageChange(**change) for change in extras.stage_log]
@@ -324,7 +320,7 @@ class LearnerService:
         self._record.truncate(self.training.progress.epoch)
         log.info(
             "resumed file=%s epoch=%d frames=%d",
-            files[-1],
+            file,
             self.training.progress.epoch,
             self.training.progress.frames,
         )

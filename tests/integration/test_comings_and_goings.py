@@ -15,9 +15,10 @@ from common.comms.transport import TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.env.rally_env import EnvConfig
+from common.policy.actor_critic import NetworkConfig
 from common.policy.weights import load_policy, save_policy
 from services.actor.service import NoRalliesError
-from services.learner.checkpoint import checkpoints
+from services.learner.checkpoint import CheckpointError, checkpoints
 from services.learner.intake import IntakeConfig
 from services.learner.service import DivergedError, RunExistsError
 from tests.integration.theatre import CURRICULUM, free_endpoint, stage, wait_until
@@ -165,6 +166,16 @@ def test_a_second_run_does_not_overwrite_the_first_ones_checkpoints(tmp_path):
         s.take_down(s.learner())
         with pytest.raises(RunExistsError, match="go on with --resume, or choose another --run"):
             s.learner()
+
+
+def test_a_resume_that_does_not_fit_leaves_the_runs_settings_as_they_were(tmp_path):
+    with stage(tmp_path) as s:
+        s.take_down(s.learner())
+        before = (tmp_path / "config.toml").read_text()
+        with pytest.raises(CheckpointError, match="doesn't fit this configuration"):
+            s.learner(resume=True, network=NetworkConfig(units=(8, 8)))
+
+    assert (tmp_path / "config.toml").read_text() == before
 
 
 def synchronous_run(folder, gate=0.0):

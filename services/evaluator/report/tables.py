@@ -95,8 +95,12 @@ def _policies(one: GroupResult) -> str:
     text = "1 seed" if seeds == 1 else f"{seeds} seeds"
     if len(played) > seeds:
         text = f"{len(played)} runs of {text}"
-    parts = sum(len(mean_of(result.run.policy)) for result in played)
-    return f"{text}, mean of {parts} policies" if parts else text
+    means = [parts for result in played if (parts := mean_of(result.run.policy))]
+    if means:
+        text += (
+            f", mean of {len(means[0])} policies" if len(played) == 1 else ", means of policies among them"
+        )
+    return text
 
 
 def count_of(frames: int | None) -> str:

@@ -2,6 +2,7 @@ import os
 import signal
 import socket
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -10,7 +11,7 @@ from common.process import BAD_CONFIG
 from common.run_folder import RunAliveError, RunFolder
 from deploy.child import Assignment
 from deploy.config import HANDED_DOWN, DeployConfig, service_sections, shared_out, way_to_hub
-from deploy.local import check_ports, metrics_ports, prepared, settings, specs, spent
+from deploy.local import RunFailedError, check_ports, metrics_ports, prepared, settings, specs, spent
 from deploy.processes import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Family, Spec, restart_pause
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
@@ -102,12 +103,11 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         service_sections(config, *words)
         for config, words in ((DeployConfig(), ("r", "e", "f")), (changed, ("s", "d", "g")))
     )
-    by_the_process = {"id", "index"}  # on its command line
     to_all = {"run", "endpoint", "tls_ca", "tls_certificate", "tls_key", "seed"}
     for role, names in HANDED_DOWN.items():
         differing = {name for name in usual[role] if usual[role][name] != other[role][name]}
         constant = {"mode"} & set(names)
-        assert differing | constant == (set(names) - by_the_process) | to_all, role
+        assert differing | constant == set(names) | to_all, role
 
 
 @pytest.mark.parametrize(
@@ -120,6 +120,10 @@ def test_what_a_run_hands_down_is_what_its_services_are_told():
         ("--generator.of", "give --generators"),
         ("--evaluator.network.units", "give --network.units"),
         ("--actor.index", "the run sets it"),
+        ("--learner.id", "the run sets it"),
+        ("--learner.metrics-port", "give --metrics-port"),
+        ("--learner.resume", "give --resume"),
+        ("--evaluator.policy", "the run sets it"),
         ("--actor.tls-key", "give --tls-key"),
     ],
 )
@@ -236,7 +240,9 @@ def test_a_run_that_goes_on_with_other_actors_shares_out_anew_what_nobody_asked_
         ((1, 256, 1), ("--actors", "2", "--actor.envs", "256"), (256, 2)),
         ((2, 128, 2), ("--actors", "8"), (32, 8)),
         ((2, 64, 2), (), (64, 2)),
-        ((2, 64, 2), ("--actors", "4"), (64, 2)),
+        ((2, 64, 2), ("--actors", "4"), (64, 4)),
+        ((1, 128, 1), ("--actors", "2"), (128, 2)),
+        ((2, 128, 6), ("--actors", "4"), (64, 6)),
     ],
 )
 def test_a_record_of_what_each_actor_got_is_taken_for_nobody_having_asked(
@@ -249,6 +255,47 @@ def test_a_record_of_what_each_actor_got_is_taken_for_nobody_having_asked(
     record(RunFolder.of("r").config, {"local": local})
 
     assert dealt(settings(["--run", "r", "--resume", *resumed])) == expected
+
+
+def test_a_run_goes_on_with_settings_that_fit_only_what_it_recorded(tmp_path, monkeypatch):
+    """Lower bound of the rate from the record, upper one from a flag: judged by the defaults they would be crossed."""
+    monkeypatch.chdir(tmp_path)
+    with prepared(settings(["--run", "r", "--learner.ppo.learning-rate-min", "4e-6"])):
+        pass
+
+    resumed = settings(["--run", "r", "--resume", "--learner.ppo.learning-rate-max", "1.2e-5"])
+
+    assert (resumed.learner.ppo.learning_rate_min, resumed.learner.ppo.learning_rate_max) == (4e-6, 1.2e-5)
+
+
+def test_a_run_that_fails_before_it_trained_anything_keeps_its_settings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with prepared(settings(["--run", "r"])):
+        pass
+    before = RunFolder.of("r").config.read_text()
+
+    def fail(*rows):
+        with suppress(RunFailedError), prepared(settings(["--run", "r", "--resume", "--network.units", "8"])):
+            RunFolder.of("r").metrics.write_text("\n".join(("epoch,frames,seconds", *rows)))
+            raise RunFailedError("the checkpoint doesn't fit")
+
+    fail()
+    assert RunFolder.of("r").config.read_text() == before
+    fail("1,8192,0.5")
+    assert RunFolder.of("r").config.read_text() != before
+
+
+def test_of_a_run_that_is_alive_deploy_is_named_first_who_ends_the_learner_before_its_actors(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for flags in (("--resume",), ()):
+        with (
+            prepared(settings(["--run", f"r{len(flags)}"])) as (name, folder, _),
+            folder.held_by("learner"),
+            pytest.raises(RunAliveError, match=f"run '{name}' is alive: deploy.local, "),
+        ):
+            prepared(settings(["--run", name, *flags])).__enter__()
 
 
 TLS = ("--tls-ca", "ca.pem", "--tls-certificate", "hub.pem", "--tls-key", "hub.key")

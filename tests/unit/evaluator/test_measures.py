@@ -99,6 +99,11 @@ def test_a_best_that_was_measured_on_other_balls_is_no_best(now, alike):
     kept = EvaluatorConfig()
     contract = contract_of(
         kept.env, kept.network, kept.launch, run="r", generation=1, version=1, stage=3, frames=1
-    ).model_copy(update={"measures": match_of(kept)})
-
-    assert measured_alike(contract, EvaluatorConfig(**now)) == alike
+    )
+    earlier = contract.env | {"observation": {"critic": "privileged"}}  # before these settings were there
+    for played, env in (
+        ({"rallies": kept.rallies - 1, "match": match_of(kept)}, contract.env),  # a fault has ended one
+        ({"rallies": kept.rallies}, earlier),
+    ):
+        measured = contract.model_copy(update={"measures": played, "env": env})
+        assert measured_alike(measured, EvaluatorConfig(**now)) == alike

@@ -1,9 +1,10 @@
 import pytest
 
-from common.config import record, to_table
+from common.config import ConfigError, record, to_table
 from common.run_folder import RunFolder
 from services.learner.__main__ import settings
 from services.learner.config import LearnerConfig
+from services.learner.intake import IntakeConfig
 from services.learner.ppo import PPOConfig
 
 
@@ -45,6 +46,21 @@ def test_a_copied_folder_is_resumed_as_itself_not_as_what_it_was_copied_from():
 
     assert (found.run, found.folder, found.seed) == ("copy", "", 5)
     assert (by_folder.run, by_folder.folder, by_folder.seed) == ("r", "runs/copy", 5)
+
+
+@pytest.mark.parametrize(
+    ("values", "flags"),
+    [
+        ({"ppo": PPOConfig(learning_rate_min=4e-6)}, ["--ppo.learning-rate-max", "1.2e-5"]),
+        ({"intake": IntakeConfig(queue_rollouts=600)}, ["--intake.dataset-rollouts", "300"]),
+    ],
+)
+def test_what_is_given_now_is_judged_beside_the_record_and_not_beside_the_defaults(values, flags):
+    recorded(**values)
+
+    settings(["--run", "r", "--resume", *flags])
+    with pytest.raises(ConfigError):
+        settings(["--run", "other", *flags])
 
 
 def test_a_run_without_a_record_is_resumed_with_what_is_given():
