@@ -96,19 +96,9 @@ def load(
         ConfigError: An unknown or unusable setting.
         HelpRequest: ``--help`` is among the flags.
     """
-    environ = os.environ if environ is None else environ
     settings = settings_of(model)
-    not_here = elsewhere(settings)
-    flags, file = _read_flags(argv, model, settings, prog, section, not_here, set_by)
-    environment = _read_environment(environ, settings, section, not_here, set_by)
-    file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
-    layers = (
-        flags,
-        environment,
-        _read_file(file, settings, section) if file else _Layer(),
-        _nested_defaults(settings),
-    )
-    return _checked(model, layers, settings, section)
+    layers = _read(model, settings, argv, prog, section, environ, elsewhere(settings), set_by, recorded)
+    return _checked(model, (*layers, _nested_defaults(settings)), settings, section)
 
 
 def first_look(
@@ -139,12 +129,8 @@ def first_look(
         ConfigError: An unknown flag or variable, or one of these settings is unusable.
         HelpRequest: ``--help`` is among the flags.
     """
-    environ = os.environ if environ is None else environ
     settings = settings_of(model)
-    flags, file = _read_flags(argv, model, settings, prog, section, elsewhere(settings), "the run")
-    environment = _read_environment(environ, settings, section, elsewhere(settings), "the run")
-    file = file or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
-    layers = [flags, environment, _read_file(file, settings, section) if file else _Layer()]
+    layers = _read(model, settings, argv, prog, section, environ, elsewhere(settings), "the run", None)
     some = [
         _Layer({name: layer.values[name] for name in names if name in layer.values}, layer.origins)
         for layer in layers
@@ -153,7 +139,7 @@ def first_look(
         name: (model.model_fields[name].annotation, model.model_fields[name]) for name in names
     }
     looked_at = _checked(create_model("Some", **fields), some, settings, section)
-    return looked_at, frozenset(flags.origins | environment.origins)
+    return looked_at, frozenset(layers[0].origins | layers[1].origins)
 
 
 def to_table(model: BaseModel) -> dict[str, Any]:
@@ -215,6 +201,25 @@ def _nested_defaults(settings: Mapping[str, Setting]) -> _Layer:
 
 
 # ---- the sources
+
+
+def _read(
+    model: type[BaseModel],
+    settings: Mapping[str, Setting],
+    argv: Sequence[str],
+    prog: str,
+    section: str,
+    environ: Mapping[str, str] | None,
+    elsewhere: Mapping[str, str],
+    set_by: str,
+    recorded: Path | None,
+) -> tuple[_Layer, _Layer, _Layer]:
+    """Return what flags, environment and file say."""
+    environ = os.environ if environ is None else environ
+    flags, file = _read_flags(argv, model, settings, prog, section, elsewhere, set_by)
+    environment = _read_environment(environ, settings, section, elsewhere, set_by)
+    file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
+    return flags, environment, _read_file(file, settings, section) if file else _Layer()
 
 
 def _read_flags(
