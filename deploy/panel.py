@@ -71,6 +71,10 @@ def _metres(values: Mapping[str, float], name: str) -> str:
     return f"{values[name]:.2f} m" if name in values else "-"
 
 
+def _number(values: Mapping[str, float], name: str, form: str) -> str:
+    return format(values[name], form) if name in values else "-"
+
+
 def render(view: View, now: float) -> RenderableType:
     """Return the panel."""
     learner = view.statuses.get(("learner", "0"))
@@ -108,11 +112,11 @@ def render(view: View, now: float) -> RenderableType:
 
     learning = Table.grid(padding=(0, 3))
     learning.add_row(
-        f"reward {gauges.get('reward', 0):.1f}",
-        f"lag {gauges.get('lag', 0):.2f}",
-        f"KL {gauges.get('kl', 0):.4f}",
-        f"learning rate {gauges.get('learning_rate', 0):.1e}",
-        f"explained variance {gauges.get('explained_variance', 0):.2f}",
+        f"reward {_number(gauges, 'reward', '.1f')}",
+        f"lag {_number(gauges, 'lag', '.2f')}",
+        f"KL {_number(gauges, 'kl', '.4f')}",
+        f"learning rate {_number(gauges, 'learning_rate', '.1e')}",
+        f"explained variance {_number(gauges, 'explained_variance', '.2f')}",
     )
     ledger = Table.grid(padding=(0, 3))
     ledger.add_row(

@@ -41,6 +41,7 @@ def test_it_is_drawn_before_anything_is_heard():
 
     assert "Topspin night" in text
     assert "-:--" in text
+    assert "reward -" in text  # and not 0.0, which would be one
 
 
 def test_it_shows_where_the_run_stands():
