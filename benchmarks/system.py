@@ -4,7 +4,6 @@ Starts a real run with `deploy.local`'s own topology, learning on, lets it warm 
 """
 
 import argparse
-import csv
 import json
 import os
 import shutil
@@ -20,7 +19,7 @@ from common.comms.keys import Keys
 from common.comms.messages import Status
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.run_folder import RunFolder
+from common.run_folder import RunFolder, whole_rows
 from deploy.config import DeployConfig
 from deploy.local import load_endpoint, prepared, specs
 from deploy.processes import Family
@@ -78,8 +77,7 @@ def measure_prepared(
         if transport is not None:
             transport.close()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with folder.metrics.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = whole_rows(folder.metrics)
     window = [
         row for row in rows if before.counters["frames"] < float(row["frames"]) <= after.counters["frames"]
     ]

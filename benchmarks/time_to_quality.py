@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from common.run_folder import RunFolder
+from common.run_folder import RunFolder, whole_rows
 
 RETURN_RATE, TARGET_ERROR = 0.81, 0.31  # [share], [m] the paper's table
 LOOK_S = 1.0
@@ -29,15 +29,6 @@ def is_reached(row: dict[str, Any], return_rate: float, target_error: float) -> 
     """Return whether an evaluation meets both figures."""
     error = float(row["target_error_mean"] or math.inf)
     return float(row["return_rate"] or 0.0) >= return_rate and error <= target_error
-
-
-def read_curve(path: Path) -> list[dict[str, Any]]:
-    """Return the evaluations written so far; a line that is still being written is left for later."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        lines = [line for line in file.readlines() if line.endswith("\n")]
-    return list(csv.DictReader(lines))
 
 
 def train(name: str, minutes: float, goal: tuple[float, float], more: list[str], goes_on: bool) -> list[Any]:
@@ -59,7 +50,8 @@ def train(name: str, minutes: float, goal: tuple[float, float], more: list[str],
     with subprocess.Popen([*command, *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             while process.poll() is None:
-                for row in read_curve(folder.evaluations)[len(curve) :]:
+                for written in whole_rows(folder.evaluations)[len(curve) :]:
+                    row: dict[str, Any] = dict(written)
                     row["minutes"] = round((time.monotonic() - started) / 60.0, 2)
                     curve.append(row)
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)

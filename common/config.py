@@ -98,7 +98,7 @@ def load(
     """
     settings = settings_of(model)
     layers = _read(model, settings, argv, prog, section, environ, elsewhere(settings), set_by, recorded)
-    return _checked(model, (*layers, _nested_defaults(settings)), settings, section)
+    return _merged(model, (*layers, _nested_defaults(settings)), settings, section)
 
 
 def first_look(
@@ -138,7 +138,7 @@ def first_look(
     fields: dict[str, Any] = {
         name: (model.model_fields[name].annotation, model.model_fields[name]) for name in names
     }
-    looked_at = _checked(create_model("Some", **fields), some, settings, section)
+    looked_at = _merged(create_model("Some", **fields), some, settings, section)
     return looked_at, frozenset(layers[0].origins | layers[1].origins)
 
 
@@ -169,16 +169,9 @@ def read_toml(file: Path) -> dict[str, Any]:
         raise ConfigError(f"{file} is not TOML: {error}") from error
 
 
-def _checked(
+def _merged(
     model: type[_Model], layers: Sequence[_Layer], settings: Mapping[str, Setting], section: str
 ) -> _Model:
-    try:
-        return _merged(model, layers)
-    except ValidationError as error:
-        raise ConfigError(_first_line(error, settings, layers, section)) from error
-
-
-def _merged(model: type[_Model], layers: Sequence[_Layer]) -> _Model:
     class Layered(BaseSettings):
         @classmethod
         def settings_customise_sources(
@@ -186,7 +179,10 @@ def _merged(model: type[_Model], layers: Sequence[_Layer]) -> _Model:
         ) -> tuple[PydanticBaseSettingsSource, ...]:
             return tuple(InitSettingsSource(settings_cls, {"settings": layer.values}) for layer in layers)
 
-    loaded = create_model("Loaded", __base__=Layered, settings=(model, ...))()
+    try:
+        loaded = create_model("Loaded", __base__=Layered, settings=(model, ...))()
+    except ValidationError as error:
+        raise ConfigError(_first_line(error, settings, layers, section)) from error
     merged: _Model = loaded.settings  # type: ignore[attr-defined]  # the field made a line above
     return merged
 

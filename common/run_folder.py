@@ -1,5 +1,6 @@
-"""Where a run keeps its things, and who may write there."""
+"""Where a run keeps its things, who may write there, and how its tables are read while somebody does."""
 
+import csv
 import errno
 import fcntl
 import logging
@@ -26,6 +27,18 @@ _NO_LOCKS: Final = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)  # a file syst
 
 class RunAliveError(ReportedError):
     """Somebody else is at work in a run folder: one line that names the process."""
+
+
+def whole_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's CSV file, by column; none where there is no file.
+
+    Half a line at the end is left out: it is still being written, or its writer was killed.
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        lines = [line for line in file if line.endswith("\n")]
+    return [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
 
 
 @dataclass(frozen=True, slots=True)

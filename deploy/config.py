@@ -176,10 +176,10 @@ def way_to_hub(config: DeployConfig, endpoint: str) -> ZenohConfig:
 def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
     """Return those dotted paths of a run's settings that are handed down, and what to set instead ("": nothing)."""
     found = {}
+    to_all = {**{name: name for name in _TO_ALL}, **ON_COMMAND_LINE}
     for path in paths:
         role, _, rest = path.partition(".")
         name, _, inner = rest.partition(".")
-        to_all = {**{name: name for name in _TO_ALL}, **ON_COMMAND_LINE}
         source = to_all.get(name, HANDED_DOWN.get(role, {}).get(name))
         if role in HANDED_DOWN and source is not None:
             known = source.partition(".")[0] in DeployConfig.model_fields

@@ -1,6 +1,5 @@
 """`python -m deploy.local`: a whole run on this machine; spawns every process and watches them."""
 
-import csv
 import json
 import logging
 import os
@@ -28,7 +27,7 @@ from common.errors import ReportedError
 from common.log import set_up_logging
 from common.policy.weights import load_policy
 from common.process import DONE, INTERRUPTED, run_service
-from common.run_folder import LATEST, LOCKS, RUNS, RunFolder
+from common.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
 from deploy.config import (
     DeployConfig,
     given_elsewhere,
@@ -200,11 +199,7 @@ def outcome(run: str, folder: RunFolder, learner: Status | None) -> dict[str, An
 
 def last_epoch(folder: RunFolder) -> dict[str, str]:
     """Return the last row of a run's metrics.csv; {} before anything is trained."""
-    if not folder.metrics.exists():
-        return {}
-    with folder.metrics.open(newline="") as file:
-        # a learner that was killed may have left half a line at the end
-        rows = [row for row in csv.DictReader(file) if None not in row.values() and None not in row]
+    rows = whole_rows(folder.metrics)
     return rows[-1] if rows else {}
 
 

@@ -41,6 +41,10 @@ class Moments:
         squares = squares + delta * delta * (self.count * (other.count / count))
         return Moments(mean, squares / count, count)
 
+    def first(self, size: int) -> "Moments":
+        """Return those of the first ``size`` numbers."""
+        return Moments(self.mean[:size], self.var[:size], self.count)
+
     def recounted(self) -> "Moments":
         """Return the same mean and variance with count 1: what a stage change does (the paper's algorithm 1)."""
         return Moments(self.mean, self.var, 1)

@@ -24,6 +24,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from common.comms.messages import PolicySnapshot
 from common.errors import ReportedError
 from common.policy.actor_critic import ActorCritic, NetworkConfig
 from common.policy.normalizer import Moments, normalize
@@ -184,6 +185,31 @@ def observation_moments(
     return Moments(mean, var, count)
 
 
+def install(
+    network: ActorCritic, snapshot: PolicySnapshot, layout: tuple[Part, ...], contract_hash: str, who: str
+) -> Moments:
+    """Load a policy that came over the wire into ``network``, and return its normaliser's moments.
+
+    Args:
+        network: Written.
+        snapshot: What came.
+        layout: What its critic sees.
+        contract_hash: ``task_hash`` of the one who installs it.
+        who: That is, for people: "actor".
+
+    Raises:
+        PolicyError: It is of another task or doesn't fit; ``network`` is as it was.
+    """
+    if snapshot.contract_hash != contract_hash:
+        raise PolicyError(
+            f"policy has contract {snapshot.contract_hash}, this {who} has {contract_hash}: "
+            "start both with the same network, env and launch settings"
+        )
+    moments = observation_moments(snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, layout)
+    unpack(network, snapshot.weights)
+    return moments
+
+
 @dataclass(frozen=True, slots=True)
 class Policy:
     """A policy to play: network, frozen normaliser and contract. Read from a folder, its critic is a blank."""
@@ -194,10 +220,9 @@ class Policy:
 
     def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is looked at."""
-        seen, moments = self.network.obs_size, self.moments
-        own = Moments(moments.mean[:seen], moments.var[:seen], moments.count)
+        seen = self.network.obs_size
         with torch.inference_mode():
-            mean = self.network.act(torch.from_numpy(normalize(obs[:, :seen], own)))
+            mean = self.network.act(torch.from_numpy(normalize(obs[:, :seen], self.moments.first(seen))))
         actions: npt.NDArray[np.float32] = mean.numpy()
         return actions
 
@@ -208,9 +233,9 @@ def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract:
     tensors: dict[str, npt.NDArray[Any]] = {
         name: value for name, value in state_tensors(network).items() if name.startswith(_ACTING)
     }
-    seen = network.obs_size
-    tensors[_OBS_MEAN], tensors[_OBS_VAR] = moments.mean[:seen], moments.var[:seen]
-    tensors[_OBS_COUNT] = np.array(moments.count, np.int64)
+    seen = moments.first(network.obs_size)
+    tensors[_OBS_MEAN], tensors[_OBS_VAR] = seen.mean, seen.var
+    tensors[_OBS_COUNT] = np.array(seen.count, np.int64)
     (folder / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
     (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
 

@@ -13,7 +13,7 @@ from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySour
 from common.env.review import Lessons
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
-from common.policy.weights import PolicyError, new_network, observation_moments, task_hash, unpack
+from common.policy.weights import install, new_network, task_hash
 from common.rally.draws import Stream, bits
 from common.rally.observation import ACTION_SIZE, critic_layout, size
 from common.rally.reward import TERMS
@@ -62,20 +62,9 @@ class Player:
 
     def adopt(self, snapshot: PolicySnapshot) -> None:
         """Play by ``snapshot`` from the next block on; raises PolicyError if it is of another layout."""
-        if snapshot.contract_hash != self.contract_hash:
-            raise PolicyError(
-                f"policy has contract {snapshot.contract_hash}, this actor has {self.contract_hash}: "
-                "start both with the same network, env and launch settings"
-            )
-        moments = observation_moments(
-            snapshot.obs_mean,
-            snapshot.obs_var,
-            snapshot.obs_count,
-            critic_layout(self.env.config.observation),
-        )
-        unpack(self._network, snapshot.weights)
-        seen = self._network.obs_size
-        self._moments = Moments(moments.mean[:seen], moments.var[:seen], moments.count)
+        layout = critic_layout(self.env.config.observation)
+        moments = install(self._network, snapshot, layout, self.contract_hash, "actor")
+        self._moments = moments.first(self._network.obs_size)
         if self.snapshot is None or self.snapshot.stage != snapshot.stage:
             self.env.set_stage(snapshot.stage)
         self.snapshot = snapshot

@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from threading import Event
 from typing import Any, Final, Protocol
@@ -44,8 +44,20 @@ def check(stop: Event) -> None:
 
 
 SET_BY: Final = "the policy's contract or the match"  # ... sets what `given_elsewhere` finds
-CONTRACTS: Final = ("control_rate_hz", "robot", "flight", "observation")
-"""Settings of the task that are a policy's own."""
+OF_CONTRACT: Final[Mapping[str, Callable[[Contract, EnvConfig], Any]]] = {
+    "control_rate_hz": lambda contract, _: contract.control_rate_hz,
+    "robot": lambda contract, _: contract.robot,
+    "observation": lambda contract, _: contract.observation_options,
+    "flight": lambda contract, env: contract.env.get(
+        "flight", env.flight
+    ),  # the oldest contracts don't say it
+}
+"""Settings of the task that are a policy's own, whatever is asked for."""
+_INSTEAD: Final = {
+    "env.noise": "noise",
+    "env.rounds": "rounds",
+    "env.observation.spin_expected": "spin_expected",
+}
 
 
 def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
@@ -53,28 +65,19 @@ def given_elsewhere(paths: Iterable[str]) -> dict[str, str]:
 
     "": nothing, the contract has it, or no match has it, being for training alone.
     """
-    found = {"env.noise": "noise", "env.rounds": "rounds", "env.observation.spin_expected": "spin_expected"}
-    owners = {f"env.{name}" for name in (*CONTRACTS, *TRAINING_ONLY, "reward")} | {"network"}
-    known = set(paths)
-    return {
-        path: instead if (instead := found.get(path, "")) in known else ""
-        for path in known
-        if path in found or path in owners or any(path.startswith(f"{owner}.") for owner in owners)
-    }
+    owned = {"network", *(f"env.{name}" for name in (*OF_CONTRACT, *TRAINING_ONLY, "reward"))}
+    known, found = set(paths), {}
+    for path in known:
+        if path in _INSTEAD or path in owned or path.startswith(tuple(f"{name}." for name in owned)):
+            instead = _INSTEAD.get(path, "")
+            found[path] = instead if instead in known else ""
+    return found
 
 
 def task_of(contract: Contract, env: EnvConfig, noise: str, rounds: int) -> EnvConfig:
     """Return the task for a policy: robot, control rate, observation and the ball's flight are its contract's."""
-    return env.model_copy(
-        update={
-            "noise": noise,
-            "rounds": rounds,
-            "control_rate_hz": contract.control_rate_hz,
-            "robot": contract.robot,
-            "observation": contract.observation_options,
-            "flight": contract.env.get("flight", env.flight),
-        }
-    )
+    own = {name: of(contract, env) for name, of in OF_CONTRACT.items()}
+    return env.model_copy(update={"noise": noise, "rounds": rounds, **own})
 
 
 def measure(

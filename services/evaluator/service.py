@@ -20,12 +20,11 @@ from common.policy.weights import (
     Policy,
     PolicyError,
     contract_of,
+    install,
     load_policy,
     new_network,
-    observation_moments,
     save_policy,
     task_hash,
-    unpack,
 )
 from common.rally.observation import critic_layout
 from common.run_folder import RunFolder
@@ -220,18 +219,8 @@ class EvaluatorService:
     def _evaluate(self, snapshot: PolicySnapshot) -> None:
         started = self._clock()
         try:
-            if snapshot.contract_hash != self._contract_hash:
-                raise PolicyError(
-                    f"policy has contract {snapshot.contract_hash}, this evaluator has {self._contract_hash}: "
-                    "start both with the same network, env and launch settings"
-                )
-            unpack(self._network, snapshot.weights)
-            moments = observation_moments(
-                snapshot.obs_mean,
-                snapshot.obs_var,
-                snapshot.obs_count,
-                critic_layout(self._config.env.observation),
-            )
+            layout = critic_layout(self._config.env.observation)
+            moments = install(self._network, snapshot, layout, self._contract_hash, "evaluator")
         except PolicyError as error:
             self._refused("policy", error)
             return

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from common.run_folder import RunAliveError, RunFolder
+from common.run_folder import RunAliveError, RunFolder, whole_rows
 
 HOLD = """
 import subprocess, sys, time
@@ -16,6 +16,15 @@ with RunFolder(Path(sys.argv[1])).held_by("learner"):
     print(child.pid, flush=True)
     time.sleep(60)
 """
+
+
+@pytest.mark.parametrize("half", ["200,0.", "200", "200\n", "200,0.5,1\n"])
+def test_half_a_line_is_left_for_later(tmp_path, half):
+    path = tmp_path / "evaluations.csv"
+    assert whole_rows(path) == []
+    path.write_text(f"frames,return_rate\n100,0.5\n{half}")
+
+    assert [row["frames"] for row in whole_rows(path)] == ["100"]
 
 
 def test_a_folder_has_one_learner_at_a_time_and_the_second_is_told_its_process(tmp_path):

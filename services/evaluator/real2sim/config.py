@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import Field
 
 from services.evaluator.filming import FilmConfig
+from services.evaluator.match import DEFAULT_ENVS, Environments
 
 
 class Real2SimConfig(FilmConfig):
@@ -40,7 +41,7 @@ class Real2SimConfig(FilmConfig):
         False, description="turn states that fly away from the robot by half a turn, instead of dropping them"
     )
     seed: int = Field(0, ge=0, lt=2**63, description="the same balls with other targets, tables and noise")
-    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    envs: Environments = DEFAULT_ENVS
     out: str = Field("", description="folder for a report with tables, plots and a film; empty: none")
     shown: int = Field(6, ge=0, le=60, description="recordings that the report draws one by one")
     video: str = Field(

@@ -1,6 +1,5 @@
 """Reading a run folder: settings, curves and policy, each of which may be missing, and then it is said."""
 
-import csv
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy.typing as npt
 
 from common.errors import ReportedError
 from common.policy.weights import Policy, PolicyError, load_policy
-from common.run_folder import RUNS, RunFolder
+from common.run_folder import RUNS, RunFolder, whole_rows
 
 Array = npt.NDArray[np.float64]
 
@@ -101,27 +100,19 @@ def read(run: str, which: str = "best") -> Run:
     return Run(folder.root.name, settings, training, curve, policy, tuple(missing))
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    """Return the whole rows of a CSV file; a process that was killed may have left half a line at the end."""
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return [row for row in csv.DictReader(file) if None not in row.values() and None not in row]
-
-
 def _column(rows: list[dict[str, str]], name: str) -> Array:
     return np.array([float(row.get(name) or "nan") for row in rows])
 
 
 def _training(path: Path) -> Training | None:
-    rows = _rows(path)
+    rows = whole_rows(path)
     if not rows:
         return None
     return Training(*(_column(rows, name) for name in ("frames", "seconds", "stage")))
 
 
 def _curve(path: Path, training: Training | None) -> Curve | None:
-    rows = _rows(path)
+    rows = whole_rows(path)
     if not rows:
         return None
     frames = _column(rows, "frames")

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.rally.launch_presets import PresetName
+from services.evaluator.match import DEFAULT_ENVS, Environments
 
 
 class ReportConfig(BaseModel):
@@ -26,4 +27,4 @@ class ReportConfig(BaseModel):
     rounds_too: bool = Field(
         False, description="play once more with five rallies an episode: how long do rallies go on"
     )
-    envs: int = Field(250, ge=1, le=65536, description="environments played together")
+    envs: Environments = DEFAULT_ENVS

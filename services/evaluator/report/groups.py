@@ -74,9 +74,10 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     more += ["sample age"] if seen.get("age", False) else []
     filtered = seen.get("ball", "sampled") == "filtered"
     own = "37 numbers, ball filtered" if filtered else "37 numbers"
-    told = " + ".join([own, *more] if filtered or not more else more)
     if more == USUAL:
         told = "ball filtered" if filtered else ""
+    else:
+        told = " + ".join([own, *more] if filtered or not more else more)
     critic = seen.get("critic", "policy")
     return (
         (stages, stages),

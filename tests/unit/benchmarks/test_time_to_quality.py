@@ -1,8 +1,8 @@
-"""When the goal counts as met, and reading a curve that is still being written."""
+"""When the goal counts as met."""
 
 import pytest
 
-from benchmarks.time_to_quality import is_reached, read_curve
+from benchmarks.time_to_quality import is_reached
 
 
 @pytest.mark.parametrize(
@@ -13,11 +13,3 @@ def test_the_goal_is_both_figures_at_once(returned, error, reached):
     row = {"return_rate": returned, "target_error_mean": error}
 
     assert is_reached(row, 0.81, 0.31) is reached
-
-
-def test_half_a_line_is_left_for_later(tmp_path):
-    path = tmp_path / "evaluations.csv"
-    assert read_curve(path) == []
-    path.write_text("frames,return_rate\n100,0.5\n200,0.")
-
-    assert [row["frames"] for row in read_curve(path)] == ["100"]

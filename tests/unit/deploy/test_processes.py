@@ -276,7 +276,7 @@ def test_a_run_that_fails_before_it_trained_anything_keeps_its_settings(tmp_path
 
     def fail(*rows):
         with suppress(RunFailedError), prepared(settings(["--run", "r", "--resume", "--network.units", "8"])):
-            RunFolder.of("r").metrics.write_text("\n".join(("epoch,frames,seconds", *rows)))
+            RunFolder.of("r").metrics.write_text("\n".join(("epoch,frames,seconds", *rows, "")))
             raise RunFailedError("the checkpoint doesn't fit")
 
     fail()
