@@ -125,6 +125,11 @@ def sent(outbox: Outbox, sequence: int) -> Outbox:
     return _changed(outbox, sequence, lambda flight: replace(flight, under_way=True, tries=flight.tries + 1))
 
 
+def at_once(outbox: Outbox, now: float) -> Outbox:
+    """Return the outbox with everything due now that waited to be sent again."""
+    return replace(outbox, flights=tuple(replace(flight, next_try=now) for flight in outbox.flights))
+
+
 def unanswered(outbox: Outbox, sequence: int, now: float) -> Outbox:
     """Return the outbox after a request ended without an answer: the same number goes out again later."""
     return _changed(outbox, sequence, lambda flight: _backed_off(flight, outbox.config, now))

@@ -143,11 +143,15 @@ class ActorService:
         self.leave()
 
     def leave(self) -> None:
-        """Wait a moment for the last verdicts, and tell the learner that nothing will follow."""
-        deadline = time.monotonic() + LAST_VERDICTS_S
-        while self._pending and time.monotonic() < deadline:
-            self._take_verdicts(time.monotonic())
+        """Wait a moment for a verdict on every rollout, and tell the learner that nothing will follow."""
+        now = time.monotonic()
+        deadline = now + LAST_VERDICTS_S
+        self._outbox = box.at_once(self._outbox, now)  # what waits for its next try has no later one
+        while self._outbox.flights and now < deadline:
+            self._send(now)
             self._transport.wait(IDLE_WAIT_S)
+            now = time.monotonic()
+            self._take_verdicts(now)
         pending = self._send_report(leaving=True, timeout_s=GOODBYE_S)
         if pending.wait() is NoReply.TIMEOUT:
             log.warning("the learner did not answer the goodbye")

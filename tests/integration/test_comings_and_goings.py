@@ -139,6 +139,35 @@ def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp
     assert min(reconnects) >= 1
 
 
+def test_an_actor_that_leaves_sends_what_no_learner_has_answered_yet(tmp_path):
+    with stage(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        actor = s.actor(0, run=False)
+
+        def plays_until(condition):
+            def is_so():
+                actor.service.step(time.monotonic())
+                return condition()
+
+            return is_so
+
+        wait_until(plays_until(lambda: actor.service.counts.accepted >= 1), 60, "a first verdict")
+        s.take_down(learner)
+        wait_until(plays_until(lambda: actor.metric("topspin_rollouts_retried_total") >= 3), 20, "a retry")
+        assert actor.service.counts.in_flight > 0
+        again = s.learner(resume=True)
+        wait_until(lambda: actor.transport.connected, 20, "the link")
+        actor.service.leave()
+        left = actor.service.counts
+        again.end()
+        ledger = again.service.ledger()
+
+    assert left.in_flight == left.balance == 0
+    assert ledger.balance == ledger.lost == 0
+    assert ledger.published == left.published
+
+
 @pytest.mark.parametrize(
     ("budget", "spent"), [({"frames": 2048}, "2,048 of 2,048 frames"), ({"minutes": 0.02}, "of 0.02 minutes")]
 )
