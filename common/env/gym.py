@@ -23,7 +23,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from common.env.local_rallies import LocalRallies
-from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv
+from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, TeacherConfig
 from common.physics.flight import FULL, SIMPLE
 from common.rally.observation import ACTION, PAPER_OBSERVATION, Part, policy_layout
 
@@ -53,8 +53,9 @@ class _Table:
         self._count, self._stage, self._launch = count, stage, launch
         given = EnvConfig(**{**DEFAULTS, **settings})
         seen = given.observation.model_copy(update={"critic": "policy"})
-        # Nobody here is told what the last actions before a hit should have been
-        self._config = given.model_copy(update={"observation": seen, "hindsight": False})
+        # Nobody here is told what the last actions before a hit should have been, or what another would have done
+        apart = {"observation": seen, "hindsight": False, "teacher": TeacherConfig()}
+        self._config = given.model_copy(update=apart)
         self.observation_space = _box(policy_layout(seen))
         self.env: RallyEnv | None = None
 

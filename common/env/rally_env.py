@@ -17,7 +17,7 @@ from common.physics.flight import FULL, SIMPLE
 from common.rally import play
 from common.rally.draws import Stream, between, uniform
 from common.rally.noise import PROFILES, Condition, NoiseProfile
-from common.rally.observation import ACTION_SIZE, ObservationConfig, critic_layout, size
+from common.rally.observation import ACTION_SIZE, ObservationConfig, critic_layout, policy_layout, size
 from common.rally.prediction import new_tracks
 from common.rally.reward import RewardConfig, reward_table
 from common.rally.trajectory import Outcome, transition_table
@@ -28,6 +28,30 @@ Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
+
+
+class TeacherConfig(BaseModel):
+    """A policy that a new one learns from first, for as long as it says what it would have done itself.
+
+    It may see more than its pupil: DAgger (Ross, Gordon, Bagnell 2011), with a teacher who looks at other numbers.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    policy: str = Field(
+        "", description="policy folder, the same path for learner and actors; empty: no teacher"
+    )
+    epochs: int = Field(
+        600,
+        ge=1,
+        description="first epochs of a run, in which the policy learns what the teacher would have done in its place; "
+        "then from rewards, as without one",
+        json_schema_extra={"unit": "datasets"},
+    )
+
+    def teaches(self, version: int) -> bool:
+        """Return whether the policy of this version, one an epoch, is still being taught."""
+        return bool(self.policy) and version < self.epochs
 
 
 class EnvConfig(BaseModel):
@@ -69,6 +93,7 @@ class EnvConfig(BaseModel):
     hindsight: bool = Field(
         True, description="in stage 3, tell the learner what the last actions before a hit should have been"
     )
+    teacher: TeacherConfig = TeacherConfig()
     rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
     reset_spread: float = Field(
         0.1,
@@ -170,6 +195,7 @@ class RallyEnv:
         stage: Curriculum stage 1..3, the reward's column.
         threads: MuJoCo threads.
         path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
+        onlooker: What somebody besides is told of the same rallies (``look_on``), of no more history than the policy.
     """
 
     def __init__(
@@ -180,6 +206,7 @@ class RallyEnv:
         stage: int = 1,
         threads: int = 1,
         path_rows: int = 0,
+        onlooker: ObservationConfig | None = None,
     ) -> None:
         if path_rows and config.collision == "original":
             raise ValueError("a path under collision 'original': allowed is 'tailored', or no path")
@@ -193,6 +220,7 @@ class RallyEnv:
         self._source = source
         self._review = self._make_review()
         self._told = play.told_by(config.observation)
+        self._onlooker = onlooker
         self._rallies, self._step = play.allocate(
             count,
             config.observation.history,
@@ -300,6 +328,15 @@ class RallyEnv:
             lessons=lessons,
         )
 
+    def look_on(self) -> Floats:
+        """Return what the onlooker sees now (B, D): ``observation.policy_layout`` of its options."""
+        if self._onlooker is None:
+            raise RuntimeError("look_on() without an onlooker: give one to the constructor")
+        seen = np.empty((self.count, size(policy_layout(self._onlooker))), np.float32)
+        told = play.told_by(self._onlooker)._replace(is_privileged=False)
+        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, told, seen)
+        return seen
+
     def _make_collision(self, threads: int) -> Collision:
         preset, rate = self.config.robot, self.config.control_rate_hz
         if self.config.collision == "original":
@@ -309,7 +346,8 @@ class RallyEnv:
     def _new_tracks(self) -> Array:
         """Return a row for each ball, or none where nobody asks what its samples tell."""
         options = self.config.observation
-        return new_tracks(self.count if options.is_tracked else 0, options.spin_expected)
+        is_tracked = options.is_tracked or (self._onlooker is not None and self._onlooker.is_tracked)
+        return new_tracks(self.count if is_tracked else 0, options.spin_expected)
 
     def _make_review(self) -> Review | None:
         """Return who corrects hits, if anybody does."""

@@ -11,6 +11,7 @@ import torch
 from common.comms.messages import Episodes, PolicySnapshot, Rollout
 from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
 from common.env.review import Lessons
+from common.env.teacher import teacher_of
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import install, new_network, task_hash
@@ -48,7 +49,8 @@ class Player:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         torch.set_num_threads(1)  # a second thread makes small matrices slower, and takes the learner's core
-        self.env = RallyEnv(envs, config, source)
+        self._teacher = teacher_of(config)
+        self.env = RallyEnv(envs, config, source, onlooker=self._teacher.sees if self._teacher else None)
         self.contract_hash = task_hash(network, config.model_dump(mode="json"), launch)
         self.snapshot: PolicySnapshot | None = None
         self._obs_size = size(critic_layout(config.observation))
@@ -89,6 +91,7 @@ class Player:
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
+        teacher = self._teacher if self.env.config.teacher.teaches(snapshot.version) else None
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
         seen = self._network.obs_size
@@ -102,11 +105,14 @@ class Player:
                 log_mu[t] = log_prob(action, mean, self._network.log_sigma).numpy()
             actions[t] = action.numpy()
             acted = self._clock()
+            if teacher:
+                corrections[t] = teacher.advice(self.env) - actions[t]
             step = self.env.step(actions[t])
             self._obs = step.obs
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated
             terms += step.terms.sum(axis=0)
-            correct(corrections, t, step.lessons)
+            if not teacher:
+                correct(corrections, t, step.lessons)
             cut = step.truncated[step.ended]
             if cut.any():
                 final_obs.append(step.final_obs[cut])
@@ -134,7 +140,8 @@ class Player:
             last_obs=self._obs.copy(),
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
-            corrections=np.where(np.abs(actions) < 1.0, corrections, 0.0),
+            # An action that was clipped is no basis for what a hit says; what a teacher says has none
+            corrections=np.where((np.abs(actions) < 1.0) | bool(teacher), corrections, 0.0),
             seconds=MappingProxyType({"inference": inference, "simulation": simulation}),
         )
 

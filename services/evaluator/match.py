@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.env.rally_env import EnvConfig, FinishedRallies, Launches, RallyEnv
+from common.env.rally_env import EnvConfig, FinishedRallies, Launches, RallyEnv, TeacherConfig
 from common.physics.flight import FULL, SIMPLE
 from common.policy.weights import Policy
 from common.rally.launch import Purpose, RallyBlock, draw_rallies
@@ -19,7 +19,12 @@ from services.evaluator.measures import Played
 
 DEFAULT_ENVS = 250
 EPISODES_EACH = 4  # whole ones that an environment has rallies for
-TRAINING_ONLY: Final[Mapping[str, Any]] = {"go_on": 0.0, "foresee": 0.0, "hindsight": False}
+TRAINING_ONLY: Final[Mapping[str, Any]] = {
+    "go_on": 0.0,
+    "foresee": 0.0,
+    "hindsight": False,
+    "teacher": TeacherConfig(),
+}
 """What only training asks for has no place in a match: every flight is played to its end, and nobody is taught."""
 
 # Settings of every command that plays a match

@@ -1,8 +1,8 @@
 """Settings of the learner."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
@@ -47,3 +47,11 @@ class LearnerConfig(ServiceConfig):
         description="time without a dataset after which the log says what is missing",
         json_schema_extra={"unit": "s"},
     )
+
+    @model_validator(mode="after")
+    def _a_teacher_is_heard(self) -> Self:
+        if self.env.teacher.policy and self.ppo.correction_weight == 0:
+            raise ValueError(
+                "ppo.correction_weight 0 beside env.teacher.policy; allowed: above 0, or nobody learns what it says"
+            )
+        return self

@@ -51,6 +51,11 @@ def next_stage(stage: int, epochs_in_stage: int, catch_rate: float, config: Curr
     return stage
 
 
+def lesson_rate(version: int, epochs: int, highest: float, lowest: float) -> float:
+    """Return the learning rate of imitation: linear from ``highest`` to ``lowest`` over the teacher's epochs."""
+    return highest + min(version / epochs, 1.0) * (lowest - highest)
+
+
 def learning_rate_bound(
     stage: int, epochs_in_stage: int, highest: float, lowest: float, config: CurriculumConfig
 ) -> float:

@@ -12,6 +12,7 @@ At lag 0 pi_prox = mu, w = 1: plain PPO.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Literal, Self
 
 import numpy as np
@@ -61,7 +62,7 @@ class PPOConfig(BaseModel):
         500.0,
         ge=0,
         description="weight of the loss that draws the mean towards what the last actions before a hit should have "
-        "been; 0: PPO alone",
+        "been, or a teacher's; 0: PPO alone",
     )
     refit_epochs: int = Field(
         24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
@@ -93,6 +94,19 @@ class Dataset:
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
     corrections: Tensor  # (N, A) what the mean should change by; rows of zeros: nothing is known
+
+
+class Lesson(Enum):
+    """What the policy learns from in an update; the critic learns the rewards in each.
+
+    NOTHING: for the first epochs of a stage, whose rewards the critic doesn't know yet: by the old ones it would punish
+    the very contact that leads on to them. TEACHER: what the corrections say, without a trust region, which is for
+    steps whose worth is guessed from noisy returns (with it, KL held the learning rate to 2e-5).
+    """
+
+    REWARDS = auto()
+    NOTHING = auto()
+    TEACHER = auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,19 +143,20 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
 
 
-def correction_loss(mean: Tensor, mean_prox: Tensor, corrections: Tensor) -> Tensor:
+def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
     """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
-    The corrected are mean_prox + correction: how the policy that this update began with should have acted.
+    The corrected are acted + correction. What a hit says is added to the mean that this update began with: how that
+    should have acted, the noise left out.
 
     Args:
         mean: (N, A).
-        mean_prox: (N, A).
+        acted: (N, A).
         corrections: (N, A); rows of zeros say nothing. A zero in any other says: as it was (of an action that was
             clipped, of a drive at its limit).
     """
     says = (corrections != 0.0).any(-1)
-    return 0.5 * ((mean - mean_prox - corrections).square().sum(-1) * says).mean()
+    return 0.5 * ((mean - acted - corrections).square().sum(-1) * says).mean()
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -181,7 +196,7 @@ def update(
     generator: torch.Generator,
     explained: float = 0.0,
     breathe: Callable[[], None] = lambda: None,
-    hold_policy: bool = False,
+    lesson: Lesson = Lesson.REWARDS,
 ) -> UpdateStats:
     """Run the mini-epochs of one epoch; ``network`` and ``optimizer`` are changed in place.
 
@@ -195,16 +210,15 @@ def update(
         generator: Shuffles the minibatches.
         explained: Explained variance of the values that the dataset was built with, passed through.
         breathe: Called between gradient steps.
-        hold_policy: Learn the critic alone, the policy's parameters frozen. For the first epochs of a stage, whose
-            rewards the critic doesn't know yet: by the old ones it would punish the very contact that leads on to
-            them.
+        lesson: What the policy learns from.
     """
     count = len(data.obs)
     parameters = list(network.parameters())
+    learns = lesson is not Lesson.NOTHING
     for parameter in network.policy_parameters():
-        parameter.requires_grad_(not hold_policy)  # a frozen one has no gradient, and Adam leaves it alone
+        parameter.requires_grad_(learns)  # a frozen one has no gradient, and Adam leaves it alone
     sums = np.zeros(6)
-    is_corrected = config.correction_weight > 0 and not hold_policy and bool((data.corrections != 0.0).any())
+    is_corrected = config.correction_weight > 0 and learns and bool((data.corrections != 0.0).any())
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
         for group in optimizer.param_groups:
@@ -217,9 +231,8 @@ def update(
                 mean, values = network(data.obs[rows])
             mean, values = mean.float(), values.float()
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
-            if hold_policy:
-                loss_policy = torch.zeros(())
-            else:
+            loss_policy = torch.zeros(())
+            if lesson is Lesson.REWARDS:
                 loss_policy = policy_loss(
                     log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
                 )
@@ -228,7 +241,9 @@ def update(
             loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
             loss_correction = torch.zeros(())
             if is_corrected:
-                loss_correction = correction_loss(mean, data.mean_prox[rows], data.corrections[rows])
+                # A teacher says what he would have done, whatever was; a hit, how to change what led to it
+                acted = (data.actions if lesson is Lesson.TEACHER else data.mean_prox)[rows]
+                loss_correction = correction_loss(mean, acted, data.corrections[rows])
                 loss = loss + config.correction_weight * loss_correction
             if config.entropy_weight > 0:
                 loss = loss - config.entropy_weight * entropy(network.log_sigma)
@@ -254,7 +269,7 @@ def update(
             kl_sum += kl
             steps, batches = steps + 1, batches + 1
         kl = kl_sum / max(batches, 1)
-        if not hold_policy:
+        if lesson is Lesson.REWARDS:
             learning_rate = adapted_learning_rate(
                 learning_rate, kl, config.learning_rate_min, learning_rate_max, config.target_kl
             )

@@ -24,6 +24,7 @@ from common.comms.messages import (
 from common.comms.transport import Flow, Transport
 from common.config import record, to_table
 from common.env.robot import home_action
+from common.env.teacher import teacher_of
 from common.errors import ReportedError
 from common.metrics import Metrics
 from common.policy.actor_critic import ActorCritic
@@ -93,6 +94,9 @@ class LearnerService:
                 f"run {config.run!r} has checkpoints in {self._folder.checkpoints}: "
                 "go on with --resume, or choose another --run"
             )
+        teacher_of(
+            config.env
+        )  # raises where it couldn't teach: actors would end and be started again for ever
         self._folder.create()
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
@@ -104,6 +108,7 @@ class LearnerService:
             notice=max(1, config.intake.lag_aimed_at),
             observation=config.env.observation,
             guard=config.guard,
+            teacher=config.env.teacher,
         )
         self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._generation = int(time.time())

@@ -9,16 +9,18 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import Rollout
+from common.env.rally_env import TeacherConfig
 from common.policy.actor_critic import ActorCritic, NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
 from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
-from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
+from services.learner.curriculum import CurriculumConfig, learning_rate_bound, lesson_rate, next_stage
 from services.learner.guard import GuardConfig, Health, divergence, running_mean, watched
 from services.learner.ppo import (
     Dataset,
+    Lesson,
     PPOConfig,
     UpdateStats,
     arithmetic,
@@ -145,6 +147,7 @@ class Training:
         notice: Datasets that a stage still takes after its gate has opened: those that are being collected then.
         observation: What policy and critic see.
         guard: When training counts as diverged.
+        teacher: Who the policy learns from first.
     """
 
     def __init__(
@@ -157,6 +160,7 @@ class Training:
         notice: int = 1,
         observation: ObservationConfig = PAPER_OBSERVATION,
         guard: GuardConfig = GuardConfig(),
+        teacher: TeacherConfig = TeacherConfig(),
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
@@ -171,6 +175,7 @@ class Training:
         self.curriculum = curriculum
         self.notice = notice
         self.guard = guard
+        self.teacher = teacher
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
@@ -205,6 +210,7 @@ class Training:
             breathe: Called between gradient steps, so that the caller can look after other things.
         """
         before = self.progress
+        is_taught = self.teacher.teaches(before.version)
         data, explained = self._dataset(rollouts)
         bound = learning_rate_bound(
             before.stage,
@@ -218,17 +224,18 @@ class Training:
         is_refitting = before.refitting and (
             refitted < self.ppo.refit_epochs and explained < self.ppo.refit_variance
         )
+        lesson = Lesson.NOTHING if is_refitting else Lesson.TEACHER if is_taught else Lesson.REWARDS
         stats = update(
             self.network,
             self.optimizer,
             data,
             self.ppo,
-            bound if is_refitting else min(before.learning_rate, bound),
+            self._rate(lesson, bound),
             bound,
             self.generator,
             explained,
             breathe,
-            hold_policy=is_refitting,
+            lesson,
         )
         frozen = moments = self.obs_moments
         for rollout in rollouts:
@@ -275,6 +282,15 @@ class Training:
         lag = float(np.mean([before.version - r.version for r in rollouts]))
         diverged = divergence(health, self.is_finite, self.guard)
         return EpochStats(self.progress, stats, play, changed, diverged, lag, frames)
+
+    def _rate(self, lesson: Lesson, bound: float) -> float:
+        """Return the learning rate that an update begins with."""
+        ppo = self.ppo
+        if lesson is Lesson.TEACHER:
+            return lesson_rate(
+                self.progress.version, self.teacher.epochs, ppo.learning_rate, ppo.learning_rate_min
+            )
+        return bound if lesson is Lesson.NOTHING else min(self.progress.learning_rate, bound)
 
     @torch.no_grad()
     def _follow(self) -> None:
@@ -327,6 +343,7 @@ class Training:
     def _dataset(self, rollouts: Sequence[Rollout]) -> tuple[Dataset, float]:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""
         ppo, log_sigma = self.ppo, self.network.log_sigma.detach().clone()
+        is_taught = self.teacher.teaches(self.progress.version)
         parts: list[tuple[torch.Tensor, ...]] = []
         advantages, returns, values_all = [], [], []
         with torch.no_grad():
@@ -350,6 +367,9 @@ class Training:
                     ppo.gamma,
                     ppo.gae_lambda,
                 )
+                # The last of a teacher's words come when rewards are learned from: they aren't corrections of hits
+                is_late = self.teacher.teaches(r.version) and not is_taught
+                said = np.zeros_like(r.corrections) if is_late else r.corrections
                 parts.append(
                     (
                         obs,
@@ -357,7 +377,7 @@ class Training:
                         torch.tensor(r.log_mu.reshape(-1)),
                         log_prob(actions, mean, log_sigma),
                         mean,
-                        torch.tensor(r.corrections.reshape(-1, r.corrections.shape[-1])),
+                        torch.tensor(said.reshape(-1, said.shape[-1])),
                     )
                 )
                 advantages.append(advantage.reshape(-1))

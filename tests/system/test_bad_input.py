@@ -64,6 +64,19 @@ def one_line(folder, module, *arguments):
             1,
             "no hub answered .* start the learner",
         ),
+        (LEARNER, "--env.teacher.policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
+        (
+            LEARNER,
+            "--env.teacher.policy p --ppo.correction-weight 0",
+            2,
+            "ppo.correction_weight 0 beside env.teacher.policy",
+        ),
+        (
+            DEPLOY,
+            "--env.teacher.policy p --learner.ppo.correction-weight 0",
+            2,
+            "ppo.correction_weight 0 beside env.teacher.policy",
+        ),
         (EVALUATOR, "--policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
     ],
 )

@@ -9,11 +9,12 @@ from common.env.rally_env import EnvConfig, Launches
 from common.env.review import NO_LESSONS, Lessons
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import normalize
-from common.policy.weights import PolicyError, new_network, observation_moments, pack
+from common.policy.weights import PolicyError, load_policy, new_network, observation_moments, pack
 from common.rally.hindsight import BACK
 from common.rally.launch import draw_rallies
-from common.rally.observation import critic_layout, size
+from common.rally.observation import critic_layout, policy_layout, size
 from services.actor.player import Player, correct
+from tests.unit.env.test_teacher import write_teacher
 
 ENVS, HORIZON = 6, 40
 NETWORK = NetworkConfig(units=(16, 8))
@@ -248,6 +249,29 @@ def test_who_is_told_nothing_learns_nothing(monkeypatch, stage, changes):
     assert block.episodes.caught.any()
     assert block.corrections.shape == block.actions.shape
     np.testing.assert_array_equal(block.corrections, 0.0)
+
+
+@pytest.mark.parametrize("version", [6, 7])
+def test_while_it_teaches_a_teacher_alone_says_what_an_action_should_have_been(tmp_path, version):
+    teacher = write_teacher(tmp_path / "t").model_copy(update={"epochs": 7})
+    config = CONFIG.model_copy(update={"teacher": teacher})
+    player = Player(config, NETWORK, Dealer(), 64, HORIZON, 1)
+    torch.manual_seed(0)
+    home = pack(new_network(NETWORK, OBSERVATION, player.env.home_action))
+    player.adopt(make_snapshot(player, stage=3, version=version, weights=home))
+    block = player.play("a", 9, 3)
+
+    assert block.episodes.caught.any()
+    if version < 7:
+        seen = block.obs[..., : size(policy_layout(OBSERVATION))]
+        advised = [load_policy(tmp_path / "t").act(obs).clip(-1, 1) for obs in seen]
+        np.testing.assert_allclose(block.actions + block.corrections, advised, atol=1e-6)
+    else:
+        silent = Player(CONFIG, NETWORK, Dealer(), 64, HORIZON, 1)
+        silent.adopt(make_snapshot(silent, stage=3, version=version, weights=home))
+        alone = silent.play("a", 9, 3)
+        assert (alone.corrections != 0.0).any()
+        np.testing.assert_array_equal(block.corrections, alone.corrections)
 
 
 def test_nothing_is_played_before_there_is_a_policy():

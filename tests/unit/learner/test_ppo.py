@@ -8,6 +8,7 @@ from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.weights import new_network
 from services.learner.ppo import (
     Dataset,
+    Lesson,
     PPOConfig,
     adapted_learning_rate,
     bound_loss,
@@ -136,7 +137,14 @@ def test_holding_the_policy_fits_the_value_and_leaves_the_actions():
 
     for k in range(10):
         stats = update(
-            network, optimizer, data, config, 1e-3, 1e-3, torch.Generator().manual_seed(k), hold_policy=True
+            network,
+            optimizer,
+            data,
+            config,
+            1e-3,
+            1e-3,
+            torch.Generator().manual_seed(k),
+            lesson=Lesson.NOTHING,
         )
 
     with torch.no_grad():
@@ -239,6 +247,41 @@ def test_an_update_moves_the_mean_towards_the_corrections():
     assert stats.correction_loss > 0
 
 
+def test_a_taught_policy_learns_what_it_is_told_to_do_and_nothing_from_rewards():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    told = torch.full((7,), 0.3)
+    config = PPOConfig(minibatch=128, mini_epochs=4)
+
+    def lesson(seed):
+        data = make_data(network, seed=seed)
+        data = replace(data, corrections=told - data.actions)  # whatever was done
+        return data, update(
+            network,
+            optimizer,
+            data,
+            config,
+            2e-3,
+            1e-4,
+            torch.Generator().manual_seed(seed),
+            lesson=Lesson.TEACHER,
+        )
+
+    first, stats = lesson(0)
+    for seed in range(1, 30):
+        last = lesson(seed)[1]
+
+    with torch.no_grad():
+        mean, _ = network(make_data(network, seed=99).obs)
+    torch.testing.assert_close(mean, told.expand_as(mean), atol=0.03, rtol=0)
+    assert torch.equal(network.log_sigma, first.log_sigma_prox)
+    assert stats.policy_loss == 0.0
+    assert stats.learning_rate == 2e-3  # no trust region steers it
+    assert last.correction_loss < 0.01 * stats.correction_loss
+    assert last.value_loss < stats.value_loss
+
+
 def test_a_held_policy_is_not_corrected():
     torch.manual_seed(0)
     network = new_network(NetworkConfig(units=(32, 32)))
@@ -252,7 +295,7 @@ def test_a_held_policy_is_not_corrected():
         1e-3,
         1e-3,
         torch.Generator().manual_seed(0),
-        hold_policy=True,
+        lesson=Lesson.NOTHING,
     )
 
     with torch.no_grad():

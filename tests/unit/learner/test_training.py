@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from common.comms.messages import Episodes
+from common.env.rally_env import TeacherConfig
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments, normalize
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
@@ -251,6 +252,23 @@ def test_a_correction_goes_with_the_observation_it_was_made_for():
     raw = np.concatenate([r.obs.reshape(-1, 37) for r in rollouts])
     np.testing.assert_array_equal(data.corrections.numpy(), np.repeat(raw[:, :1], 7, axis=1))
     np.testing.assert_allclose(data.obs[:, 0].numpy(), np.clip(raw[:, 0], -5, 5), rtol=1e-4)
+
+
+def test_who_has_been_taught_goes_on_from_rewards_with_small_steps_and_without_the_last_words():
+    training = make_training()
+    training.teacher = TeacherConfig(policy="somewhere", epochs=2)
+    told = [make_rollout(k, corrections=np.ones((16, 8, 7), np.float32)) for k in range(2)]
+    rates = [training.run_epoch(told).update.learning_rate for _ in range(2)]
+    late, _ = training._dataset([told[0], make_rollout(2, version=2, corrections=told[0].corrections)])
+    after = training.run_epoch(told).update
+
+    assert rates == pytest.approx(
+        [PPO.learning_rate, 0.5 * (PPO.learning_rate + PPO.learning_rate_min)]
+    )  # linear over the two epochs
+    np.testing.assert_array_equal(late.corrections[:128], 0.0)
+    np.testing.assert_array_equal(late.corrections[128:], 1.0)
+    assert after.correction_loss == 0.0
+    assert after.policy_loss != 0.0
 
 
 @pytest.mark.parametrize("aiming_log_sigma", [-2.5, -1.0])

@@ -1,0 +1,112 @@
+"""A teacher is shown the very rallies that its pupil plays, by its own observation."""
+
+import numpy as np
+import pytest
+
+from common.env.rally_env import EnvConfig, RallyEnv, TeacherConfig
+from common.env.teacher import teacher_of
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import Moments
+from common.policy.weights import PolicyError, contract_of, load_policy, new_network, save_policy
+from common.rally.launch import draw_rallies
+from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
+from tests.unit.env.rallies import Deck, random_actions
+
+NETWORK = NetworkConfig(units=(16, 8))
+MORE = ObservationConfig(critic="policy")
+PAPER = EnvConfig(observation=PAPER_OBSERVATION)
+
+
+def write_teacher(folder, **task):
+    env = EnvConfig(**task)
+    width = size(policy_layout(env.observation))
+    network = new_network(NETWORK, env.observation.model_copy(update={"critic": "policy"}))
+    moments = Moments(np.zeros(width), np.full(width, 4.0), 10)
+    contract = contract_of(env, NETWORK, "paper", run="t", generation=1, version=1, stage=3, frames=1)
+    save_policy(folder, network, moments, contract)
+    return TeacherConfig(policy=str(folder), epochs=5)
+
+
+@pytest.mark.parametrize("sees", [MORE, PAPER_OBSERVATION, ObservationConfig(ball="filtered", spin="true")])
+@pytest.mark.parametrize("shown", [PAPER_OBSERVATION, ObservationConfig(ball="filtered", spin="hidden")])
+def test_an_onlooker_sees_what_it_would_see_playing(sees, shown):
+    def environment(config, **options):
+        return RallyEnv(6, EnvConfig(observation=config), Deck(draw_rallies(64, seed=5)), **options)
+
+    env, own = environment(shown, onlooker=sees), environment(sees)
+    env.reset()
+    seen = own.reset()
+    width = size(policy_layout(sees))
+    for action in random_actions(env, 80):
+        np.testing.assert_array_equal(env.look_on(), seen[:, :width])
+        env.step(action)
+        seen = own.step(action).obs
+
+
+def test_looking_on_changes_nothing():
+    def environment(**options):
+        return RallyEnv(6, PAPER, Deck(draw_rallies(64, seed=5)), **options)
+
+    watched, alone = environment(onlooker=MORE), environment()
+    np.testing.assert_array_equal(watched.reset(), alone.reset())
+    for action in random_actions(alone, 60):
+        watched.look_on()
+        one, other = watched.step(action), alone.step(action)
+        np.testing.assert_array_equal(one.obs, other.obs)
+        np.testing.assert_array_equal(one.reward, other.reward)
+
+
+def test_nobody_looks_on_unless_asked_to():
+    env = RallyEnv(2, PAPER, Deck(draw_rallies(8, seed=5)))
+    env.reset()
+
+    with pytest.raises(RuntimeError, match="without an onlooker"):
+        env.look_on()
+
+
+def test_advice_is_what_the_policy_in_the_folder_would_have_done(tmp_path):
+    config = PAPER.model_copy(update={"teacher": write_teacher(tmp_path / "t", observation=MORE)})
+    teacher = teacher_of(config)
+    env = RallyEnv(6, config, Deck(draw_rallies(64, seed=5)), onlooker=teacher.sees)
+    env.reset()
+    advice = teacher.advice(env)
+
+    assert teacher.sees == MORE
+    assert advice.shape == (6, 7)
+    np.testing.assert_array_equal(advice, load_policy(tmp_path / "t").act(env.look_on()).clip(-1, 1))
+
+
+def test_a_task_without_a_teacher_has_none():
+    assert teacher_of(PAPER) is None
+    assert not PAPER.teacher.teaches(0)
+
+
+def test_a_teacher_teaches_the_first_epochs():
+    assert [TeacherConfig(policy="p", epochs=3).teaches(version) for version in range(5)] == [True] * 3 + [
+        False
+    ] * 2
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [
+        ({"control_rate_hz": 100}, "control_rate_hz is 100.0; allowed is the task's, 50"),
+        ({"robot": "usst"}, "robot is usst; allowed is the task's, rails"),
+        (
+            {"observation": ObservationConfig(history=2)},
+            "observation.history is 2; allowed is the task's, 0",
+        ),
+    ],
+)
+def test_who_could_not_play_the_task_cannot_teach_it(tmp_path, theirs, said):
+    config = PAPER.model_copy(update={"teacher": write_teacher(tmp_path / "t", **theirs)})
+
+    with pytest.raises(PolicyError, match=said):
+        teacher_of(config)
+
+
+def test_a_teacher_that_is_not_there_is_named(tmp_path):
+    config = PAPER.model_copy(update={"teacher": TeacherConfig(policy=str(tmp_path / "nobody"))})
+
+    with pytest.raises(PolicyError, match=r"no policy in .*nobody"):
+        teacher_of(config)
