@@ -74,7 +74,7 @@ def one_line(folder, module, *arguments):
         (
             DEPLOY,
             "--env.teacher.policy p --learner.ppo.correction-weight 0",
-            2,
+            1,
             "ppo.correction_weight 0 beside env.teacher.policy",
         ),
         (EVALUATOR, "--policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
