@@ -48,6 +48,13 @@ class TeacherConfig(BaseModel):
         "then from rewards, as without one",
         json_schema_extra={"unit": "datasets"},
     )
+    towards_middle: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="share of the way to the court's middle by which the targets shown to the teacher are moved: a pupil "
+        "that sees less misses by more, and should aim farther inside",
+    )
 
     def teaches(self, version: int) -> bool:
         """Return whether the policy of this version, one an epoch, is still being taught."""

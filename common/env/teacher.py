@@ -6,10 +6,14 @@ import numpy as np
 import numpy.typing as npt
 
 from common.env.rally_env import EnvConfig, RallyEnv
+from common.physics.constants import TABLE_HALF_LENGTH
 from common.policy.weights import Policy, PolicyError, load_policy
-from common.rally.observation import ObservationConfig
+from common.rally.observation import OBSERVATION, ObservationConfig, offsets
 
 Floats = npt.NDArray[np.float32]
+
+_TARGET = offsets(OBSERVATION)["target"]
+_MIDDLE = np.array([0.5 * TABLE_HALF_LENGTH, 0.0], np.float32)
 
 
 class Teacher:
@@ -17,10 +21,11 @@ class Teacher:
 
     Args:
         policy: It, read from its folder.
+        towards_middle: Share of the way to the middle of the opponent's court by which targets are moved for it.
     """
 
-    def __init__(self, policy: Policy) -> None:
-        self._policy = policy
+    def __init__(self, policy: Policy, towards_middle: float = 0.0) -> None:
+        self._policy, self._towards_middle = policy, towards_middle
 
     @property
     def sees(self) -> ObservationConfig:
@@ -29,7 +34,9 @@ class Teacher:
 
     def advice(self, env: RallyEnv) -> Floats:
         """Return what it would do now (B, 7), within [-1, 1]."""
-        return np.clip(self._policy.act(env.look_on()), -1.0, 1.0)
+        seen = env.look_on()
+        seen[:, _TARGET] += self._towards_middle * (_MIDDLE - seen[:, _TARGET])
+        return np.clip(self._policy.act(seen), -1.0, 1.0)
 
 
 def teacher_of(task: EnvConfig) -> Teacher | None:
@@ -51,4 +58,4 @@ def teacher_of(task: EnvConfig) -> Teacher | None:
             raise PolicyError(
                 f"teacher {task.teacher.policy}: {name} is {theirs}; allowed is the task's, {ours}"
             )
-    return Teacher(policy)
+    return Teacher(policy, task.teacher.towards_middle)

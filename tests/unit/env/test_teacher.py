@@ -76,6 +76,20 @@ def test_advice_is_what_the_policy_in_the_folder_would_have_done(tmp_path):
     np.testing.assert_array_equal(advice, load_policy(tmp_path / "t").act(env.look_on()).clip(-1, 1))
 
 
+def test_the_teacher_of_a_pupil_that_should_play_safe_is_shown_targets_farther_inside(tmp_path):
+    given = write_teacher(tmp_path / "t", observation=MORE).model_copy(update={"towards_middle": 0.25})
+    teacher = teacher_of(PAPER.model_copy(update={"teacher": given}))
+    env = RallyEnv(6, PAPER, Deck(draw_rallies(64, seed=5)), onlooker=teacher.sees)
+    env.reset()
+    shown = env.look_on()
+    shown[:, 30] = 0.75 * shown[:, 30] + 0.25 * 0.685
+    shown[:, 31] *= 0.75
+
+    np.testing.assert_allclose(
+        teacher.advice(env), load_policy(tmp_path / "t").act(shown).clip(-1, 1), atol=1e-6
+    )
+
+
 def test_a_task_without_a_teacher_has_none():
     assert teacher_of(PAPER) is None
     assert not PAPER.teacher.teaches(0)
