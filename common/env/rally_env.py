@@ -52,8 +52,8 @@ class TeacherConfig(BaseModel):
         0.0,
         ge=0,
         lt=1,
-        description="share of the way to the court's middle by which the targets shown to the teacher are moved: a pupil "
-        "that sees less misses by more, and should aim farther inside",
+        description="share of the way to the court's middle by which the targets shown to the teacher are moved: a "
+        "pupil that sees less misses by more, and should aim farther inside",
     )
 
     def teaches(self, version: int) -> bool:
