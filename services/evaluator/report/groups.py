@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from services.evaluator.report.collect import Run
@@ -58,7 +59,7 @@ def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Return what a person calls the experiment: curriculum, collisions, observation and critic, whole and short.
+    """Return what a person calls the experiment: curriculum, teacher, collisions, observation, critic, whole and short.
 
     What is usual is short for nothing.
     """
@@ -79,8 +80,11 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     else:
         told = " + ".join([own, *more] if filtered or not more else more)
     critic = seen.get("critic", "policy")
+    teacher = env.get("teacher", {}).get("policy", "")
+    taught = f"taught by {Path(teacher).name}" if teacher else ""
     return (
         (stages, stages),
+        (taught, taught),
         (collision, "" if collision == "tailored collisions" else collision),
         (" + ".join([f"sees {own}", *more]), told),
         ("critic sees the truth", "")
@@ -101,7 +105,7 @@ def group(runs: Sequence[Run]) -> tuple[Group, ...]:
     for of_one, part, extra in zip(members, parts, extras, strict=True):
         varies = [k for k in range(len(part)) if k == 0 or len({other[k] for other in parts}) > 1]
         label = ", ".join([part[k][1] for k in varies if part[k][1]] + extra)
-        groups.append(Group(label, ", ".join([whole for whole, _ in part] + extra), tuple(of_one)))
+        groups.append(Group(label, ", ".join([whole for whole, _ in part if whole] + extra), tuple(of_one)))
     return tuple(groups)
 
 

@@ -176,6 +176,7 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("g", env={"observation": {"critic": "privileged"} | usual}),
             make_run("h", env={"observation": {"critic": "privileged", "ball": "filtered"}}),
             make_run("i", env={"observation": {"critic": "privileged", "ball": "filtered"} | usual}),
+            make_run("j", env=privileged | {"teacher": {"policy": "assets/policies/default"}}),
         ]
     )
 
@@ -189,6 +190,7 @@ def test_groups_are_called_by_what_tells_them_apart():
         "stages 1+2+3",
         "stages 1+2+3, 37 numbers, ball filtered",
         "stages 1+2+3, ball filtered",
+        "stages 1+2+3, taught by default, 37 numbers",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"
