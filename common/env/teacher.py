@@ -40,7 +40,7 @@ class Teacher:
 
 
 def teacher_of(task: EnvConfig) -> Teacher | None:
-    """Return a task's teacher, or None where it has none.
+    """Return a task's teacher, or None where it has none. What spins it is told to expect is the task's.
 
     Raises:
         PolicyError: It can't be read, or couldn't play the task itself.

@@ -3,8 +3,10 @@
 import csv
 import json
 
+from common.env.rally_env import EnvConfig
 from common.policy.weights import load_policy
-from tests.integration.theatre import stage, wait_until
+from tests.integration.theatre import CURRICULUM, stage, wait_until
+from tests.unit.env.test_teacher import write_teacher
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 
@@ -47,3 +49,25 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
         json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
     )
     assert list((tmp_path / "tb").iterdir())
+
+
+def test_a_taught_run_learns_from_its_teacher_first_and_from_rewards_then(tmp_path):
+    task = EnvConfig(teacher=write_teacher(tmp_path / "teacher").model_copy(update={"epochs": 3}))
+    with stage(
+        tmp_path / "run", curriculum=CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6})
+    ) as s:
+        learner = s.learner(env=task)
+        generator, actors = s.generator(), [s.actor(k, env=task) for k in range(2)]
+        learner.join(60)
+        for entry in (*actors, generator):
+            entry.end()
+        ledger = learner.service.ledger()
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+
+    taught, later = rows[:3], rows[3:]
+    assert later
+    assert all(float(row["correction_loss"]) > 0 and float(row["policy_loss"]) == 0 for row in taught)
+    assert all(float(row["policy_loss"]) != 0 for row in later)
+    assert ledger.refused == {}
+    assert ledger.balance == ledger.lost == 0
