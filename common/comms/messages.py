@@ -154,7 +154,8 @@ class Rollout:
     last_obs: Annotated[F32, Wire("as the observation", "<f4", "B D")]  # after step T: bootstrap at the cut
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
-    # What the actions before a hit should have differed by (hindsight.correction); rows of zeros: nothing is known
+    # By what the actions before a hit should have differed (hindsight.correction), or all of them where a teacher
+    # says what it would have done; rows of zeros: nothing is known
     corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 

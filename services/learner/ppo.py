@@ -93,7 +93,9 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: Tensor  # (N, A) what the mean should change by; rows of zeros: nothing is known
+    corrections: (
+        Tensor  # (N, A) what mean, or taught, action should change by; rows of zeros: nothing is known
+    )
 
 
 class Lesson(Enum):

@@ -94,9 +94,8 @@ class LearnerService:
                 f"run {config.run!r} has checkpoints in {self._folder.checkpoints}: "
                 "go on with --resume, or choose another --run"
             )
-        teacher_of(
-            config.env
-        )  # raises where it couldn't teach: actors would end and be started again for ever
+        # Raises where it couldn't teach: actors would end for it, and be started again for ever
+        teacher_of(config.env)
         self._folder.create()
         self._record = Record(self._folder.metrics, self._folder.tensorboard)
         self.training = Training(
