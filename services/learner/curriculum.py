@@ -51,9 +51,9 @@ def next_stage(stage: int, epochs_in_stage: int, catch_rate: float, config: Curr
     return stage
 
 
-def lesson_rate(version: int, epochs: int, highest: float, lowest: float) -> float:
-    """Return the learning rate of imitation: linear from ``highest`` to ``lowest`` over the teacher's epochs."""
-    return highest + min(version / epochs, 1.0) * (lowest - highest)
+def decayed(gone: float, highest: float, lowest: float) -> float:
+    """Return a learning rate that falls linearly from ``highest`` to ``lowest`` as ``gone`` rises from 0 to 1."""
+    return highest + min(gone, 1.0) * (lowest - highest)
 
 
 def learning_rate_bound(
@@ -62,5 +62,4 @@ def learning_rate_bound(
     """Return the learning rate's upper bound: constant, then linear to ``lowest`` over the last stage."""
     if stage < 3 or config.stage_3 == 0:
         return highest
-    gone = min(epochs_in_stage / config.stage_3, 1.0)
-    return highest + gone * (lowest - highest)
+    return decayed(epochs_in_stage / config.stage_3, highest, lowest)

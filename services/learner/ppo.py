@@ -93,9 +93,7 @@ class Dataset:
     log_sigma_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: (
-        Tensor  # (N, A) what mean, or taught, action should change by; rows of zeros: nothing is known
-    )
+    corrections: Tensor  # (N, A) by what mean, or taught, actions should change; rows of zeros: nothing known
 
 
 class Lesson(Enum):

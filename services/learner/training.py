@@ -16,7 +16,7 @@ from common.policy.weights import new_network
 from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
-from services.learner.curriculum import CurriculumConfig, learning_rate_bound, lesson_rate, next_stage
+from services.learner.curriculum import CurriculumConfig, decayed, learning_rate_bound, next_stage
 from services.learner.guard import GuardConfig, Health, divergence, running_mean, watched
 from services.learner.ppo import (
     Dataset,
@@ -196,6 +196,11 @@ class Training:
         return max(1, (config.stage_1, config.stage_2)[progress.stage - 1] - progress.epochs_in_stage)
 
     @property
+    def is_taught(self) -> bool:
+        """Whether the policy as it stands still learns from the teacher."""
+        return self.teacher.teaches(self.progress.version)
+
+    @property
     def is_finite(self) -> bool:
         """Whether every parameter is."""
         return all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
@@ -210,7 +215,6 @@ class Training:
             breathe: Called between gradient steps, so that the caller can look after other things.
         """
         before = self.progress
-        is_taught = self.teacher.teaches(before.version)
         data, explained = self._dataset(rollouts)
         bound = learning_rate_bound(
             before.stage,
@@ -224,7 +228,7 @@ class Training:
         is_refitting = before.refitting and (
             refitted < self.ppo.refit_epochs and explained < self.ppo.refit_variance
         )
-        lesson = Lesson.NOTHING if is_refitting else Lesson.TEACHER if is_taught else Lesson.REWARDS
+        lesson = Lesson.NOTHING if is_refitting else Lesson.TEACHER if self.is_taught else Lesson.REWARDS
         stats = update(
             self.network,
             self.optimizer,
@@ -287,9 +291,8 @@ class Training:
         """Return the learning rate that an update begins with."""
         ppo = self.ppo
         if lesson is Lesson.TEACHER:
-            return lesson_rate(
-                self.progress.version, self.teacher.epochs, ppo.learning_rate, ppo.learning_rate_min
-            )
+            gone = self.progress.version / self.teacher.epochs
+            return decayed(gone, ppo.learning_rate, ppo.learning_rate_min)
         return bound if lesson is Lesson.NOTHING else min(self.progress.learning_rate, bound)
 
     @torch.no_grad()
@@ -343,7 +346,6 @@ class Training:
     def _dataset(self, rollouts: Sequence[Rollout]) -> tuple[Dataset, float]:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""
         ppo, log_sigma = self.ppo, self.network.log_sigma.detach().clone()
-        is_taught = self.teacher.teaches(self.progress.version)
         parts: list[tuple[torch.Tensor, ...]] = []
         advantages, returns, values_all = [], [], []
         with torch.no_grad():
@@ -368,7 +370,7 @@ class Training:
                     ppo.gae_lambda,
                 )
                 # The last of a teacher's words come when rewards are learned from: they aren't corrections of hits
-                is_late = self.teacher.teaches(r.version) and not is_taught
+                is_late = self.teacher.teaches(r.version) and not self.is_taught
                 said = np.zeros_like(r.corrections) if is_late else r.corrections
                 parts.append(
                     (

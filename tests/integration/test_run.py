@@ -6,7 +6,7 @@ import json
 from common.env.rally_env import EnvConfig
 from common.policy.weights import load_policy
 from tests.integration.theatre import CURRICULUM, stage, wait_until
-from tests.unit.env.test_teacher import write_teacher
+from tests.unit.env.teachers import write_teacher
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 

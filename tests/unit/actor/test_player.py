@@ -14,7 +14,7 @@ from common.rally.hindsight import BACK
 from common.rally.launch import draw_rallies
 from common.rally.observation import critic_layout, policy_layout, size
 from services.actor.player import Player, correct
-from tests.unit.env.test_teacher import write_teacher
+from tests.unit.env.teachers import write_teacher
 
 ENVS, HORIZON = 6, 40
 NETWORK = NetworkConfig(units=(16, 8))

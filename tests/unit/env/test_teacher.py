@@ -5,26 +5,14 @@ import pytest
 
 from common.env.rally_env import EnvConfig, RallyEnv, TeacherConfig
 from common.env.teacher import teacher_of
-from common.policy.actor_critic import NetworkConfig
-from common.policy.normalizer import Moments
-from common.policy.weights import PolicyError, contract_of, load_policy, new_network, save_policy
+from common.policy.weights import PolicyError, load_policy
 from common.rally.launch import draw_rallies
 from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
 from tests.unit.env.rallies import Deck, random_actions
+from tests.unit.env.teachers import write_teacher
 
-NETWORK = NetworkConfig(units=(16, 8))
 MORE = ObservationConfig(critic="policy")
 PAPER = EnvConfig(observation=PAPER_OBSERVATION)
-
-
-def write_teacher(folder, **task):
-    env = EnvConfig(**task)
-    width = size(policy_layout(env.observation))
-    network = new_network(NETWORK, env.observation.model_copy(update={"critic": "policy"}))
-    moments = Moments(np.zeros(width), np.full(width, 4.0), 10)
-    contract = contract_of(env, NETWORK, "paper", run="t", generation=1, version=1, stage=3, frames=1)
-    save_policy(folder, network, moments, contract)
-    return TeacherConfig(policy=str(folder), epochs=5)
 
 
 @pytest.mark.parametrize("sees", [MORE, PAPER_OBSERVATION, ObservationConfig(ball="filtered", spin="true")])
