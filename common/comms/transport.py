@@ -112,6 +112,7 @@ class Mailbox(Generic[_Item]):
         self._keep = keep
         self._items: deque[_Item] = deque()
         self._dropped = 0
+        self._is_closed = False
 
     @property
     def dropped(self) -> int:
@@ -121,6 +122,8 @@ class Mailbox(Generic[_Item]):
     def put(self, item: _Item) -> bool:
         """Return whether ``item`` was taken in."""
         with self._bell.lock:
+            if self._is_closed:
+                return False
             if len(self._items) >= self._capacity:
                 self._dropped += 1
                 if self._keep == "oldest":
@@ -141,6 +144,12 @@ class Mailbox(Generic[_Item]):
             items = list(self._items)
             self._items.clear()
             return items
+
+    def close(self) -> list[_Item]:
+        """Take nothing in from now on; return everything that was waiting, oldest first."""
+        with self._bell.lock:
+            self._is_closed = True
+            return self.take_all()
 
     def wait(self, timeout_s: float) -> bool:
         """Return whether something is waiting, as soon as it is or after ``timeout_s``."""
@@ -225,10 +234,10 @@ class Server:
         return None if raw is None else self._read(raw)
 
     def close(self) -> None:
-        """Stop serving; requests that nobody took end with NO_SERVER."""
+        """Stop serving; requests that nobody took end with NO_SERVER, those included that are arriving now."""
         self._undeclare()
-        while (request := self.poll()) is not None:
-            request.refuse()
+        for raw in self._inbox.close():
+            self._read(raw).refuse()
 
 
 class PendingReply:

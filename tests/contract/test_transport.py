@@ -287,7 +287,9 @@ def test_a_server_that_closes_ends_the_requests_that_wait_in_it(net):
     hub, actor = net.hub(), net.client()
     server = hub.serve(f"{RUN}/rollout", capacity=8)
     answered(actor, server, f"{RUN}/rollout")
+    hub.wait(0.0)
     pending = actor.request(f"{RUN}/rollout", b"", 5.0, Flow.ROLLOUT)
+    assert hub.wait(5.0), "no request came"
 
     server.close()
 
