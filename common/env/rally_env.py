@@ -55,6 +55,22 @@ class TeacherConfig(BaseModel):
         description="share of the way to the court's middle by which the targets shown to the teacher are moved: a "
         "pupil that sees less misses by more, and should aim farther inside",
     )
+    notes: bool = Field(
+        False,
+        description="have a pupil without memory take notes: until the stroke, wrist and roll hold where the ball was "
+        "and how it flew as it was first seen, by which it shows how it spins (teacher.py)",
+    )
+    through_arm: bool = Field(
+        False,
+        description="learn as well what to do now for the arm to tell later: a memory for a policy that has no other "
+        "(gradients through kinematics and drives)",
+    )
+    log_sigma: float = Field(
+        1.0,
+        ge=-10,
+        le=1,
+        description="log of the action noise is at most this while it teaches: noise wipes out what an arm remembers",
+    )
 
     def teaches(self, version: int) -> bool:
         """Return whether the policy of this version, one an epoch, is still being taught."""

@@ -51,6 +51,16 @@ def limit_speeds(model: mujoco.MjModel, preset: RobotPreset) -> None:
             model.dof_damping[joint] = model.actuator_forcerange[joint, 1] / limit
 
 
+def inertia_at_home(model: mujoco.MjModel) -> Array:
+    """Return the joints' mass matrix at the home pose (7, 7) [kg, kg m, kg m^2]."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    inertia = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, inertia)
+    return inertia[:7, :7]
+
+
 def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
     """Return the action (7,) that holds the home pose."""
     model = load_model(preset)
@@ -144,12 +154,8 @@ class RobotBatch:
     @property
     def drives(self) -> Array:
         """``common.rally.hindsight``'s table of the drives (5, 7): inertia at home, k_p, k_v, damping, half-range."""
-        data = mujoco.MjData(self.model)
-        mujoco.mj_resetDataKeyframe(self.model, data, 0)
-        mujoco.mj_forward(self.model, data)
-        inertia = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, data, inertia)
-        return np.stack([np.diag(inertia)[:7], self._kp, self._kv, self._damping_nominal, self.half_range])
+        inertia = np.diag(inertia_at_home(self.model))
+        return np.stack([inertia, self._kp, self._kv, self._damping_nominal, self.half_range])
 
     def push_racket(self, impulse: Array) -> None:
         """Apply (B, 6) impulses [N s, N m s] about the racket's centre, spread over the next control step."""

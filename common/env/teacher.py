@@ -1,19 +1,57 @@
-"""A policy that says what it would have done in another's place."""
+"""A policy that says what it would have done in another's place, and what is worth writing down.
+
+A pupil that sees the ball as it is now, and remembers nothing, can't tell how it spins: that shows in how the flight
+bends. But it sees its own arm, and before the stroke two of its joints are free. So where notes are asked for, the
+teacher says to hold them, until shortly before the stroke, where the ball was and how it flew as the pupil saw it
+first: writing is a function of the ball, holding one of the joints, and reading is up to the pupil.
+"""
 
 from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from common.env.rally_env import EnvConfig, RallyEnv
-from common.physics.constants import TABLE_HALF_LENGTH
+from common.physics.constants import GRID_STEP, TABLE_HALF_LENGTH
 from common.policy.weights import Policy, PolicyError, load_policy
-from common.rally.observation import OBSERVATION, ObservationConfig, offsets
+from common.rally.observation import (
+    JOINT_RANGES,
+    OBSERVATION,
+    ObservationConfig,
+    offsets,
+    policy_layout,
+)
 
 Floats = npt.NDArray[np.float32]
 
-_TARGET = offsets(OBSERVATION)["target"]
+_AT = offsets(OBSERVATION)
+_TARGET = _AT["target"]
+COMING = _AT["continuous_state"].start  # tau_01: launched, and not seen to have bounced
 _MIDDLE = np.array([0.5 * TABLE_HALF_LENGTH, 0.0], np.float32)
+
+
+class Note(NamedTuple):
+    """What a joint holds: home + gain (number - middle) [half-range]."""
+
+    joint: int
+    number: int  # of the observation
+    middle: float
+    gain: float
+
+
+_JOINTS: Final = [name for name, *_ in JOINT_RANGES]
+NOTES: Final = (
+    Note(_JOINTS.index("roll"), _AT["ball_vel"].start + 1, 0.0, 0.22),  # y [m/s]: sidespin bends it
+    Note(_JOINTS.index("wrist"), _AT["ball_pos"].start + 2, 0.48, 0.8),  # z [m]: topspin makes it fall
+)
+"""Of fast joints, which a stroke needs last. Balls as they are launched take up a third to all of their range."""
+
+NOTE_JOINTS: Final = [note.joint for note in NOTES]
+
+FIRST_SEEN: Final = 0.05  # [s] after the launch notes are written
+STROKE: Final = 0.24  # [s] before a ball is met the joints are wanted for it
+_LARGEST: Final = 0.95  # [half-range]
 
 
 class Teacher:
@@ -22,21 +60,44 @@ class Teacher:
     Args:
         policy: It, read from its folder.
         towards_middle: Share of the way to the middle of the opponent's court by which targets are moved for it.
+        notes: Whether it has its pupil take notes.
     """
 
-    def __init__(self, policy: Policy, towards_middle: float = 0.0) -> None:
+    def __init__(self, policy: Policy, towards_middle: float = 0.0, notes: bool = False) -> None:
         self._policy, self._towards_middle = policy, towards_middle
+        self._notes = np.zeros((0, len(NOTES)), np.float32) if notes else None
+        self._meeting_in = offsets(policy_layout(self.sees)).get("meeting_in", slice(0)).start
 
     @property
     def sees(self) -> ObservationConfig:
         """What it must be shown: the environment's onlooker."""
         return self._policy.contract.observation_options
 
-    def advice(self, env: RallyEnv) -> Floats:
-        """Return what it would do now (B, 7), within [-1, 1]."""
+    def advice(self, env: RallyEnv, shown: Floats) -> Floats:
+        """Return what it would do now (B, 7), within [-1, 1].
+
+        Args:
+            env: The rallies; the same from call to call, a control step on.
+            shown: What the pupil sees of them (B, D).
+        """
         seen = env.look_on()
         seen[:, _TARGET] += self._towards_middle * (_MIDDLE - seen[:, _TARGET])
-        return np.clip(self._policy.act(seen), -1.0, 1.0)
+        advice = np.clip(self._policy.act(seen), -1.0, 1.0)
+        if self._notes is not None:
+            self._dictate(env, shown, seen[:, self._meeting_in], advice)
+        return advice
+
+    def _dictate(self, env: RallyEnv, shown: Floats, meeting_in: Floats, advice: Floats) -> None:
+        """Put into ``advice`` what joints that are still free should hold."""
+        numbers = shown[:, [note.number for note in NOTES]]
+        if self._notes is None or len(self._notes) != env.count:
+            self._notes = numbers
+        is_new = env.rallies.clock * GRID_STEP < FIRST_SEEN
+        self._notes = np.where(is_new[:, None], numbers, self._notes)
+        is_free = (meeting_in > STROKE) & (shown[:, COMING] > 0.5)
+        for k, note in enumerate(NOTES):
+            held = env.home_action[note.joint] + note.gain * (self._notes[:, k] - note.middle)
+            advice[:, note.joint] = np.where(is_free, held.clip(-_LARGEST, _LARGEST), advice[:, note.joint])
 
 
 def teacher_of(task: EnvConfig) -> Teacher | None:
@@ -58,4 +119,9 @@ def teacher_of(task: EnvConfig) -> Teacher | None:
             raise PolicyError(
                 f"teacher {task.teacher.policy}: {name} is {theirs}; allowed is the task's, {ours}"
             )
-    return Teacher(policy, task.teacher.towards_middle)
+    if task.teacher.notes and not contract.observation_options.prediction:
+        raise PolicyError(
+            f"teacher {task.teacher.policy}: observation.prediction is False; allowed with teacher.notes is True: "
+            "joints are free until it knows a ball is about to be met"
+        )
+    return Teacher(policy, task.teacher.towards_middle, task.teacher.notes)

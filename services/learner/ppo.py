@@ -10,7 +10,7 @@ importance weight to mu is clipped from above:
 At lag 0 pi_prox = mu, w = 1: plain PPO.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Literal, Self
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
 from common.policy.normalizer import Moments
+from services.learner.through_arm import Motion, replayed
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
@@ -94,6 +95,8 @@ class Dataset:
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
     corrections: Tensor  # (N, A) by what mean, or taught, actions should change; rows of zeros: nothing known
+    says: Tensor  # (N, A) weights of what the corrections say
+    motion: Motion | None = None  # of the arms, where gradients go through them
 
 
 class Lesson(Enum):
@@ -132,7 +135,9 @@ def arithmetic(precision: str) -> torch.autocast:
     if precision == "auto":
         can = torch.cpu.get_capabilities()
         precision = "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
-    return torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16")
+    # Without the cache of cast weights: their gradients are then summed over an arm's steps in float32
+    enabled = precision == "bfloat16"
+    return torch.autocast("cpu", torch.bfloat16, enabled=enabled, cache_enabled=False)
 
 
 def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
@@ -143,7 +148,7 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
 
 
-def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
+def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor, says: Tensor) -> Tensor:
     """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
     The corrected are acted + correction. What a hit says is added to the mean that this update began with: how that
@@ -154,9 +159,29 @@ def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
         acted: (N, A).
         corrections: (N, A); rows of zeros say nothing. A zero in any other says: as it was (of an action that was
             clipped, of a drive at its limit).
+        says: (N, A) weights.
     """
-    says = (corrections != 0.0).any(-1)
-    return 0.5 * ((mean - acted - corrections).square().sum(-1) * says).mean()
+    weights = says * (corrections != 0.0).any(-1, keepdim=True)
+    return 0.5 * ((mean - acted - corrections).square() * weights).sum(-1).mean()
+
+
+def minibatches(data: Dataset, size: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """Yield one pass over a dataset: which frames (n,), or (T, b) in the order of play where arms are led on."""
+    if data.motion is not None:
+        yield from data.motion.batches(size, generator)
+        return
+    count = len(data.obs)
+    for rows in torch.split(torch.randperm(count, generator=generator), size):
+        if len(rows) >= min(size, count) // 2:  # a small remainder would weigh as much as a full batch
+            yield rows
+
+
+def played(network: ActorCritic, data: Dataset, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return mean actions (n, A) and values (n,) of one minibatch."""
+    if data.motion is not None:
+        return replayed(network, data.obs, data.actions, data.mean_prox, data.motion, rows)
+    mean, values = network(data.obs[rows])
+    return mean.float(), values.float()
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -212,7 +237,6 @@ def update(
         breathe: Called between gradient steps.
         lesson: What the policy learns from.
     """
-    count = len(data.obs)
     parameters = list(network.parameters())
     learns = lesson is not Lesson.NOTHING
     for parameter in network.policy_parameters():
@@ -224,12 +248,10 @@ def update(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
-        for rows in torch.split(torch.randperm(count, generator=generator), config.minibatch):
-            if len(rows) < min(config.minibatch, count) // 2:
-                continue  # a small remainder would weigh as much as a full batch
+        for batch in minibatches(data, config.minibatch, generator):
             with arithmetic(config.precision):
-                mean, values = network(data.obs[rows])
-            mean, values = mean.float(), values.float()
+                mean, values = played(network, data, batch)
+            rows = batch.flatten()
             log_new = log_prob(data.actions[rows], mean, network.log_sigma)
             loss_policy = torch.zeros(())
             if lesson is Lesson.REWARDS:
@@ -243,12 +265,12 @@ def update(
             if is_corrected:
                 # A teacher says what he would have done, whatever was; a hit, how to change what led to it
                 acted = (data.actions if lesson is Lesson.TEACHER else data.mean_prox)[rows]
-                loss_correction = correction_loss(mean, acted, data.corrections[rows])
+                loss_correction = correction_loss(mean, acted, data.corrections[rows], data.says[rows])
                 loss = loss + config.correction_weight * loss_correction
             if config.entropy_weight > 0:
                 loss = loss - config.entropy_weight * entropy(network.log_sigma)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
             if not np.isfinite(norm):
                 finite = False

@@ -33,6 +33,7 @@ from common.rally.reward import TERMS
 from common.rally.trajectory import Outcome
 from common.run_folder import RunFolder
 from services.learner import checkpoint
+from services.learner.arm import Arm
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.guard import NOT_FINITE
@@ -108,6 +109,7 @@ class LearnerService:
             observation=config.env.observation,
             guard=config.guard,
             teacher=config.env.teacher,
+            arm=Arm(config.env.robot, config.env.control_rate_hz) if config.env.teacher.through_arm else None,
         )
         self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
         self._generation = int(time.time())

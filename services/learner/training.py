@@ -10,12 +10,21 @@ import torch
 
 from common.comms.messages import Rollout
 from common.env.rally_env import TeacherConfig
+from common.env.teacher import COMING, NOTE_JOINTS
 from common.policy.actor_critic import ActorCritic, NetworkConfig, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
-from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
+from common.rally.observation import (
+    OBSERVATION,
+    PAPER_OBSERVATION,
+    ObservationConfig,
+    critic_layout,
+    offsets,
+    size,
+)
 from common.rally.reward import TERMS
 from services.learner.advantage import gae
+from services.learner.arm import Arm
 from services.learner.curriculum import CurriculumConfig, decayed, learning_rate_bound, next_stage
 from services.learner.guard import GuardConfig, Health, divergence, running_mean, watched
 from services.learner.ppo import (
@@ -28,9 +37,13 @@ from services.learner.ppo import (
     explained_variance,
     update,
 )
+from services.learner.through_arm import Motion
 
 Floats = npt.NDArray[np.float32]
 
+_JOINTS = slice(offsets(OBSERVATION)["joint_pos"].start, offsets(OBSERVATION)["joint_vel"].stop)
+
+NOTE_WEIGHT = 3.0  # besides 1: what is read from a note is a difference of a tenth of what it holds
 AVERAGE_DECAY = 0.99  # of the weights' running mean, a dataset: it looks back over some 0.8 M frames
 
 
@@ -148,6 +161,7 @@ class Training:
         observation: What policy and critic see.
         guard: When training counts as diverged.
         teacher: Who the policy learns from first.
+        arm: The task's robot, where what the teacher says is learned through it; else nobody asks.
     """
 
     def __init__(
@@ -161,6 +175,7 @@ class Training:
         observation: ObservationConfig = PAPER_OBSERVATION,
         guard: GuardConfig = GuardConfig(),
         teacher: TeacherConfig = TeacherConfig(),
+        arm: Arm | None = None,
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
@@ -176,6 +191,7 @@ class Training:
         self.notice = notice
         self.guard = guard
         self.teacher = teacher
+        self.arm = arm
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
@@ -228,6 +244,8 @@ class Training:
         is_refitting = before.refitting and (
             refitted < self.ppo.refit_epochs and explained < self.ppo.refit_variance
         )
+        if self.is_taught:
+            self._calm(self.teacher.log_sigma)
         lesson = Lesson.NOTHING if is_refitting else Lesson.TEACHER if self.is_taught else Lesson.REWARDS
         stats = update(
             self.network,
@@ -347,6 +365,8 @@ class Training:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""
         ppo, log_sigma = self.ppo, self.network.log_sigma.detach().clone()
         parts: list[tuple[torch.Tensor, ...]] = []
+        rows: list[torch.Tensor] = []
+        taken = 0
         advantages, returns, values_all = [], [], []
         with torch.no_grad():
             for r in rollouts:
@@ -380,8 +400,13 @@ class Training:
                         log_prob(actions, mean, log_sigma),
                         mean,
                         torch.tensor(said.reshape(-1, said.shape[-1])),
+                        torch.from_numpy(self._weights(r)).reshape(-1, r.actions.shape[-1]),
+                        torch.tensor(r.obs[..., _JOINTS].reshape(steps * count, -1)),
+                        torch.tensor((r.terminated | r.truncated).reshape(-1)),
                     )
                 )
+                rows.append(torch.arange(taken, taken + steps * count).reshape(steps, count))
+                taken += steps * count
                 advantages.append(advantage.reshape(-1))
                 returns.append((advantage + values).reshape(-1))
                 values_all.append(values.reshape(-1))
@@ -391,9 +416,12 @@ class Training:
         scale = np.sqrt(self.value_moments.var + 1e-5)
         advantage = np.concatenate(advantages)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        obs, actions, log_mu, log_prox, mean, corrections = (
+        obs, actions, log_mu, log_prox, mean, corrections, says, joints, ended = (
             torch.cat(part) for part in zip(*parts, strict=True)
         )
+        motion = None
+        if self.arm is not None and self.is_taught:
+            motion = Motion.of(self.arm, tuple(rows), joints, actions, ended, self.obs_moments)
         targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
         data = Dataset(
             obs,
@@ -405,8 +433,17 @@ class Training:
             torch.from_numpy(advantage),
             torch.from_numpy(targets),
             corrections,
+            says,
+            motion,
         )
         return data, explained
+
+    def _weights(self, rollout: Rollout) -> Floats:
+        """Return how much what is said of each action weighs (T, B, A): more where notes are written and held."""
+        weights = np.ones_like(rollout.actions)
+        if self.is_taught and self.teacher.notes:
+            weights[..., NOTE_JOINTS] += NOTE_WEIGHT * rollout.obs[..., COMING, None]
+        return weights
 
     def _values(self, obs: Floats) -> Floats:
         if len(obs) == 0:

@@ -80,8 +80,9 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     else:
         told = " + ".join([own, *more] if filtered or not more else more)
     critic = seen.get("critic", "policy")
-    teacher = env.get("teacher", {}).get("policy", "")
-    taught = f"taught by {Path(teacher).name}" if teacher else ""
+    teacher = env.get("teacher", {})
+    taught = f"taught by {Path(teacher['policy']).name}" if teacher.get("policy") else ""
+    taught += " with notes" if taught and teacher.get("notes") else ""
     return (
         (stages, stages),
         (taught, taught),

@@ -177,6 +177,7 @@ def test_groups_are_called_by_what_tells_them_apart():
             make_run("h", env={"observation": {"critic": "privileged", "ball": "filtered"}}),
             make_run("i", env={"observation": {"critic": "privileged", "ball": "filtered"} | usual}),
             make_run("j", env=privileged | {"teacher": {"policy": "assets/policies/default"}}),
+            make_run("k", env=privileged | {"teacher": {"policy": "assets/policies/default", "notes": True}}),
         ]
     )
 
@@ -191,6 +192,7 @@ def test_groups_are_called_by_what_tells_them_apart():
         "stages 1+2+3, 37 numbers, ball filtered",
         "stages 1+2+3, ball filtered",
         "stages 1+2+3, taught by default, 37 numbers",
+        "stages 1+2+3, taught by default with notes, 37 numbers",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, sees 37 numbers, critic sees the truth"

@@ -10,6 +10,7 @@ from common.comms.messages import Episodes
 from common.env.rally_env import TeacherConfig
 from common.policy.actor_critic import NetworkConfig
 from common.policy.normalizer import Moments, normalize
+from services.learner.arm import Arm
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
 from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
@@ -269,6 +270,52 @@ def test_who_has_been_taught_goes_on_from_rewards_with_small_steps_and_without_t
     np.testing.assert_array_equal(late.corrections[128:], 1.0)
     assert after.correction_loss == 0.0
     assert after.policy_loss != 0.0
+
+
+def taught(**teacher):
+    """Return a training whose teacher teaches two epochs, and a rollout of what it says."""
+    training = make_training()
+    training.teacher = TeacherConfig(policy="somewhere", epochs=2, **teacher)
+    return training, make_rollout(0, corrections=np.ones((16, 8, 7), np.float32))
+
+
+def test_while_it_teaches_a_teacher_may_ask_for_quiet():
+    training, told = taught(log_sigma=-4.0)
+    noises = []
+    for _ in range(3):
+        training.run_epoch([told])
+        noises.append(training.network.log_sigma.detach().clone())
+
+    assert (noises[0] == -4.0).all()
+    assert torch.equal(noises[1], noises[0])
+    assert (noises[2] > -4.01).all()  # PPO's own from there on
+
+
+def test_notes_weigh_more_where_they_are_written_and_held():
+    training, told = taught(notes=True)
+    told.obs[..., 33:37] = 0.0
+    told.obs[:8, :, 33] = 1.0  # coming
+    told.obs[8:, :, 34] = 1.0  # bounced
+    weights = training._dataset([told])[0].says.numpy().reshape(16, 8, 7)
+
+    assert (weights[8:] == 1.0).all()
+    assert (weights[:8, :, :5] == 1.0).all()
+    assert (weights[:8, :, 5:] == 4.0).all()
+
+
+def test_gradients_go_through_the_arm_while_a_teacher_teaches_and_not_from_rollout_to_rollout():
+    training, told = taught()
+    training.arm = Arm()
+    motion = training._dataset([told, make_rollout(1, corrections=told.corrections)])[0].motion
+    lessons = [training.run_epoch([told]).update for _ in range(2)]
+
+    assert motion is not None
+    assert [rows.shape for rows in motion.rows] == [(16, 8), (16, 8)]
+    assert motion.rows[0][3, 5] == 3 * 8 + 5
+    np.testing.assert_array_equal(motion.before[3 * 8 + 5], told.obs[3, 5, :14])
+    np.testing.assert_array_equal(motion.rows[1] - motion.rows[0], 16 * 8)
+    assert all(lesson.finite and lesson.correction_loss > 0 for lesson in lessons)
+    assert training._dataset([told])[0].motion is None  # it has been taught
 
 
 @pytest.mark.parametrize("aiming_log_sigma", [-2.5, -1.0])
