@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from common.env.rally_env import EnvConfig, RallyEnv
+from common.env.robot import JOINTS
 from common.physics.constants import GRID_STEP, TABLE_HALF_LENGTH
 from common.policy.weights import Policy, PolicyError, load_policy
 from common.rally.observation import (
-    JOINT_RANGES,
     OBSERVATION,
     ObservationConfig,
     offsets,
@@ -40,10 +40,9 @@ class Note(NamedTuple):
     gain: float
 
 
-_JOINTS: Final = [name for name, *_ in JOINT_RANGES]
 NOTES: Final = (
-    Note(_JOINTS.index("roll"), _AT["ball_vel"].start + 1, 0.0, 0.22),  # y [m/s]: sidespin bends it
-    Note(_JOINTS.index("wrist"), _AT["ball_pos"].start + 2, 0.48, 0.8),  # z [m]: topspin makes it fall
+    Note(JOINTS.index("roll"), _AT["ball_vel"].start + 1, 0.0, 0.22),  # y [m/s]: sidespin bends it
+    Note(JOINTS.index("wrist"), _AT["ball_pos"].start + 2, 0.48, 0.8),  # z [m]: topspin makes it fall
 )
 """Of fast joints, which a stroke needs last. Balls as they are launched take up a third to all of their range."""
 
@@ -65,8 +64,9 @@ class Teacher:
 
     def __init__(self, policy: Policy, towards_middle: float = 0.0, notes: bool = False) -> None:
         self._policy, self._towards_middle = policy, towards_middle
-        self._notes = np.zeros((0, len(NOTES)), np.float32) if notes else None
-        self._meeting_in = offsets(policy_layout(self.sees)).get("meeting_in", slice(0)).start
+        self._has_notes_taken = notes
+        self._notes = np.zeros(len(NOTES), np.float32)  # (B, notes) from the first rallies on
+        self._seen_at = offsets(policy_layout(self.sees))
 
     @property
     def sees(self) -> ObservationConfig:
@@ -83,15 +83,13 @@ class Teacher:
         seen = env.look_on()
         seen[:, _TARGET] += self._towards_middle * (_MIDDLE - seen[:, _TARGET])
         advice = np.clip(self._policy.act(seen), -1.0, 1.0)
-        if self._notes is not None:
-            self._dictate(env, shown, seen[:, self._meeting_in], advice)
+        if self._has_notes_taken:
+            self._dictate(env, shown, seen[:, self._seen_at["meeting_in"].start], advice)
         return advice
 
     def _dictate(self, env: RallyEnv, shown: Floats, meeting_in: Floats, advice: Floats) -> None:
         """Put into ``advice`` what joints that are still free should hold."""
         numbers = shown[:, [note.number for note in NOTES]]
-        if self._notes is None or len(self._notes) != env.count:
-            self._notes = numbers
         is_new = env.rallies.clock * GRID_STEP < FIRST_SEEN
         self._notes = np.where(is_new[:, None], numbers, self._notes)
         is_free = (meeting_in > STROKE) & (shown[:, COMING] > 0.5)

@@ -12,13 +12,12 @@ import math
 import torch
 from torch import Tensor
 
-from common.env.robot import RobotBatch, RobotPreset, inertia_at_home
+from common.env.robot import JOINTS, RobotBatch, RobotPreset, inertia_at_home
 from common.physics.arm import FOREARM, RACKET_REACH, RAIL_HOME_X, SHOULDER_Z, UPPER_ARM
 from common.rally.observation import OBSERVATION, offsets
 
-JOINTS = 7
+DOF = len(JOINTS)
 SEEN = offsets(OBSERVATION)["racket_vel"].stop  # of an observation's numbers: joints and racket come first
-_SUBSTEP = 0.004  # [s]
 
 
 class Arm:
@@ -35,8 +34,7 @@ class Arm:
         _, self._stiffness, self._damping, self._joint_damping, self._half_range = rows
         self._middle = torch.tensor(robot.middle, dtype=torch.float32)
         self._largest = torch.tensor(robot.torque_limit, dtype=torch.float32)
-        self._substeps = max(1, round(1.0 / (control_rate_hz * _SUBSTEP)))
-        self._h = 1.0 / (control_rate_hz * self._substeps)
+        self._substeps, self._h = robot.substeps, robot.step_s
         inertia = torch.tensor(inertia_at_home(robot.model), dtype=torch.float32)
         self._mobility = torch.linalg.inv(inertia + self._h * torch.diag(self._joint_damping))
         self._drag = self._h * self._damping * self._mobility.diag()

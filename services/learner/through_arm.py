@@ -18,7 +18,7 @@ from torch import Tensor
 
 from common.policy.actor_critic import ActorCritic
 from common.policy.normalizer import CLIP, Moments, scale_of
-from services.learner.arm import JOINTS, SEEN, Arm, seen_of
+from services.learner.arm import DOF, SEEN, Arm, seen_of
 
 KEPT = 0.98  # of a gradient, a step back: what drives at their limits and feedback do to it must not add up
 
@@ -47,7 +47,7 @@ class Motion:
         moments: Moments,
     ) -> "Motion":
         """Return it, from ``before`` (N, 14), ``actions`` (N, A), ``ended`` (N,) and the normaliser's moments."""
-        after = torch.cat(arm.step(before[:, :JOINTS], before[:, JOINTS:], actions), -1)
+        after = torch.cat(arm.step(before[:, :DOF], before[:, DOF:], actions), -1)
         mean, scale = (torch.from_numpy(x[:SEEN]).float() for x in (moments.mean, scale_of(moments)))
         return cls(arm, rows, before, after, (~ended).float()[:, None], mean, scale)
 
@@ -74,11 +74,11 @@ def replayed(
         motion: Of the arms.
         rows: (T, b) frames in the order of play, a column a robot.
     """
-    apart = torch.zeros(rows.shape[1], 2 * JOINTS)
+    apart = torch.zeros(rows.shape[1], 2 * DOF)
     means, values = [], []
     for now in rows:
         joints = motion.before[now] + apart
-        pos, vel = joints[:, :JOINTS], joints[:, JOINTS:]
+        pos, vel = joints[:, :DOF], joints[:, DOF:]
         robot = ((seen_of(pos, vel) - motion.mean) / motion.scale).clamp(-CLIP, CLIP)
         mean, value = network(torch.cat((robot, obs[now, SEEN:]), -1))
         mean = mean.float()

@@ -365,8 +365,6 @@ class Training:
         """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""
         ppo, log_sigma = self.ppo, self.network.log_sigma.detach().clone()
         parts: list[tuple[torch.Tensor, ...]] = []
-        rows: list[torch.Tensor] = []
-        taken = 0
         advantages, returns, values_all = [], [], []
         with torch.no_grad():
             for r in rollouts:
@@ -401,12 +399,8 @@ class Training:
                         mean,
                         torch.tensor(said.reshape(-1, said.shape[-1])),
                         torch.from_numpy(self._weights(r)).reshape(-1, r.actions.shape[-1]),
-                        torch.tensor(r.obs[..., _JOINTS].reshape(steps * count, -1)),
-                        torch.tensor((r.terminated | r.truncated).reshape(-1)),
                     )
                 )
-                rows.append(torch.arange(taken, taken + steps * count).reshape(steps, count))
-                taken += steps * count
                 advantages.append(advantage.reshape(-1))
                 returns.append((advantage + values).reshape(-1))
                 values_all.append(values.reshape(-1))
@@ -416,12 +410,9 @@ class Training:
         scale = np.sqrt(self.value_moments.var + 1e-5)
         advantage = np.concatenate(advantages)
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        obs, actions, log_mu, log_prox, mean, corrections, says, joints, ended = (
+        obs, actions, log_mu, log_prox, mean, corrections, says = (
             torch.cat(part) for part in zip(*parts, strict=True)
         )
-        motion = None
-        if self.arm is not None and self.is_taught:
-            motion = Motion.of(self.arm, tuple(rows), joints, actions, ended, self.obs_moments)
         targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
         data = Dataset(
             obs,
@@ -434,9 +425,21 @@ class Training:
             torch.from_numpy(targets),
             corrections,
             says,
-            motion,
+            self._motion(rollouts, actions),
         )
         return data, explained
+
+    def _motion(self, rollouts: Sequence[Rollout], actions: torch.Tensor) -> Motion | None:
+        """Return what the arms did under a dataset's actions (N, A), where what is said is learned through them."""
+        if self.arm is None or not self.is_taught:
+            return None
+        frames = torch.split(torch.arange(len(actions)), [r.rewards.size for r in rollouts])
+        rows = tuple(some.reshape(r.rewards.shape) for some, r in zip(frames, rollouts, strict=True))
+        joints = np.concatenate([r.obs.reshape(-1, self.obs_size)[:, _JOINTS] for r in rollouts])
+        ended = np.concatenate([(r.terminated | r.truncated).reshape(-1) for r in rollouts])
+        return Motion.of(
+            self.arm, rows, torch.from_numpy(joints), actions, torch.from_numpy(ended), self.obs_moments
+        )
 
     def _weights(self, rollout: Rollout) -> Floats:
         """Return how much what is said of each action weighs (T, B, A): more where notes are written and held."""
