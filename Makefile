@@ -10,7 +10,7 @@ POLICY ?=
 VIDEO ?=
 OUT ?=
 
-.PHONY: help install train play pictures test test-fast check fix bench clean
+.PHONY: help install train play pictures report test test-fast check fix bench docs clean
 
 help:                     ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
@@ -20,17 +20,20 @@ install: $(STAMP)         ## make .venv with everything in it, and compile the k
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
-	$(BIN)/python -m common.compile_kernels
+	$(BIN)/python -m topspin.compile_kernels
 	@touch $(STAMP)
 
 train: $(STAMP)           ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
-	$(BIN)/python -m deploy.local --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
+	$(BIN)/topspin train --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
 
 play: $(STAMP)            ## measure a policy and film it: make play [POLICY=folder] [VIDEO=runs/play.mp4]
-	$(BIN)/python -m services.evaluator play $(if $(POLICY),--policy $(POLICY)) $(if $(VIDEO),--video $(VIDEO))
+	$(BIN)/topspin play $(if $(POLICY),--policy $(POLICY)) $(if $(VIDEO),--video $(VIDEO))
 
 pictures: $(STAMP)        ## draw the README's pictures: make pictures [POLICY=folder] [OUT=docs/pictures]
-	$(BIN)/python -m services.evaluator pictures $(if $(POLICY),--policy $(POLICY)) $(if $(OUT),--out $(OUT))
+	$(BIN)/topspin pictures $(if $(POLICY),--policy $(POLICY)) $(if $(OUT),--out $(OUT))
+
+report: $(STAMP)          ## compare runs: make report RUN="night other" [OUT=runs/report]
+	$(BIN)/topspin report $(RUN) $(if $(OUT),--out $(OUT))
 
 test: $(STAMP)            ## all tests
 	$(BIN)/python -m pytest
@@ -51,9 +54,12 @@ fix: $(STAMP)             ## format, and mend what ruff can
 bench: $(STAMP)           ## the quick benchmarks
 	$(BIN)/python -m benchmarks.generator --json
 	$(BIN)/python -m benchmarks.env --json
-	$(BIN)/python -m benchmarks.estimator --json
-	$(BIN)/python -m benchmarks.prediction --json
+	$(BIN)/python -m benchmarks.camera_filter --json
+	$(BIN)/python -m benchmarks.flight_filter --json
 	$(BIN)/python -m benchmarks.system --json
+
+docs: $(STAMP)            ## the documentation as pages: build/site/index.html
+	$(BIN)/mkdocs build --strict --quiet
 
 clean:                    ## remove the environment and caches, not the runs
 	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info

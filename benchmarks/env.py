@@ -1,43 +1,48 @@
-"""How many environment steps a second one thread plays, and what share of MuJoCo's own speed that is.
+"""Environment steps per second on one thread, and their share of MuJoCo's own speed.
 
     python -m benchmarks.env --json
 
-An environment step is everything a frame needs but the network: robot with contacts, ball, touches, reward, noise,
-observation, resets. MuJoCo's own speed is ``Batch.step`` of the same model under the same actions with the same
-time step. Short slices of both take turns, so that a busy machine slows both alike; rates and ratio are medians.
+An environment step is everything that a frame needs except the network: robot with contacts, ball, touches, reward,
+perception, observation, resets. MuJoCo's own speed is ``Batch.step`` of the same model with the same actions and time
+step. Short slices of both alternate, so that a busy machine slows both alike. Rates and ratio are medians.
 """
 
-import argparse
 import json
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from threading import Event
 
 import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
+from pydantic import Field
 
-from common.env.rally_env import EnvConfig, Launches, RallyEnv
+from benchmarks.settings import BenchmarkConfig, run
+from common.env.rally_env import Launches, RallyEnv
 from common.env.robot import load_model
-from common.rally.launch import RallyBlock, draw_rallies
-from common.rally.noise import PROFILES
+from common.task.config import Randomization, TaskConfig
+from common.task.launch import RallyBlock, draw_rallies
 
-RALLIES = 20_000  # drawn before the clock starts; dealt again from the first when they are used up
-ACTIONS = 64  # control steps of actions, played in a circle
-SPREAD = 0.2  # [half-range] of the actions about home: a policy that explores
-SLICE = 10  # control steps of one measured slice: some 100 ms
+RALLIES = 20_000  # drawn before the measurement, and repeated
+ACTIONS = 64  # control steps of actions, repeated
+SPREAD = (
+    0.2  # [half-range] standard deviation of the actions around home, as of a policy with exploration noise
+)
+SLICE = 10  # control steps of one measured slice: about 100 ms
 
 Actions = npt.NDArray[np.float32]
 
 
 class MemoryRallies:
-    """Rallies that are there already, so that drawing them isn't measured."""
+    """Rallies that are drawn in advance, so that drawing them is not measured."""
 
     def __init__(self, block: RallyBlock) -> None:
         self._block, self._next = block, 0
 
     def take(self, count: int) -> Launches:
-        """Return the next ``count`` rallies, from the first again after the last."""
+        """Return the next ``count`` rallies. After the last one the first comes again."""
         index = np.arange(self._next, self._next + count) % len(self._block.seeds)
         self._next += count
         return Launches(self._block.launches[index], self._block.seeds[index], np.ones(count, np.bool_))
@@ -45,16 +50,16 @@ class MemoryRallies:
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """What one run measured; medians over slices."""
+    """Result of one run: medians over slices."""
 
     env_steps_per_s: float
-    mujoco_steps_per_s: float  # in control steps, as the environment's
+    mujoco_steps_per_s: float  # control steps, as for the environment
     ratio: float  # median of the slices' ratios
     substeps: int
 
 
 def seconds_of(step: Callable[[Actions], object], actions: Actions) -> float:
-    """Return how long a slice takes."""
+    """Return the duration of a slice [s]."""
     start = time.perf_counter()
     for action in actions:
         step(action)
@@ -62,9 +67,9 @@ def seconds_of(step: Callable[[Actions], object], actions: Actions) -> float:
 
 
 def bare_mujoco(env: RallyEnv) -> Callable[[Actions], None]:
-    """Return a function that plays one control step of the environment's robots with nothing but MuJoCo."""
+    """Return a function that plays one control step of the environment's robots with MuJoCo alone."""
     robot = env.robot
-    batch = Batch(load_model(env.config.robot, robot.step_s), env.count, 1)
+    batch = Batch(load_model(env.task.robot, robot.step_s), env.count, 1)
     batch.reset(keyframe=0)
     ctrl = batch.bind("ctrl")
 
@@ -75,17 +80,17 @@ def bare_mujoco(env: RallyEnv) -> Callable[[Actions], None]:
     return step
 
 
-def measure(envs: int, noise: str, seconds: float, seed: int) -> Speed:
+def measure(envs: int, randomization: str, seconds: float, seed: int) -> Speed:
     """Play for ``seconds`` and return the speeds."""
-    config = EnvConfig.model_validate({"noise": noise})
-    env = RallyEnv(envs, config, MemoryRallies(draw_rallies(RALLIES, seed=seed, noise=noise)), threads=1)
+    task = TaskConfig.model_validate({"randomization": randomization})
+    env = RallyEnv(envs, task, MemoryRallies(draw_rallies(RALLIES, task, seed=seed)), threads=1)
     rng = np.random.default_rng(seed)
-    noise_of_actions = SPREAD * rng.standard_normal((ACTIONS, envs, 7))
-    actions = np.clip(env.home_action + noise_of_actions, -1.0, 1.0).astype(np.float32)
+    noise = SPREAD * rng.standard_normal((ACTIONS, envs, 7))
+    actions = np.clip(env.home_action + noise, -1.0, 1.0).astype(np.float32)
     mujoco = bare_mujoco(env)
     env.reset()
     for step in (env.step, mujoco):
-        seconds_of(step, actions)  # compiles, and spreads the rallies over their phases
+        seconds_of(step, actions)  # compiles the kernels, and spreads the rallies over their phases
     slices: list[tuple[float, float]] = []
     start = time.perf_counter()
     while time.perf_counter() - start < seconds:
@@ -98,33 +103,21 @@ def measure(envs: int, noise: str, seconds: float, seed: int) -> Speed:
     )
 
 
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.env",
-        description="Measure the environment on one thread against MuJoCo's own step of the same robots.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+class EnvConfig(BenchmarkConfig):
+    """Measure the speed of the environment on one thread, and compare it with MuJoCo's own step of the same robots."""
+
+    envs: int = Field(512, ge=1, le=65536, description="robots in the batch")
+    randomization: Randomization = Field("standard", description="profile of what differs between rallies")
+    seconds: float = Field(
+        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
     )
-    parser.add_argument("--envs", type=int, default=512, metavar="B", help="robots in the batch, 1 or more")
-    parser.add_argument("--noise", choices=PROFILES, default="standard", help="what differs between rallies")
-    parser.add_argument("--seconds", type=float, default=10.0, metavar="S", help="how long to measure, > 0")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of rallies and actions, 0 or more")
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
-    options = parser.parse_args(arguments)
-    if options.envs < 1:
-        parser.error(f"--envs: got {options.envs}; allowed: 1 or more")
-    if options.seed < 0:
-        parser.error(f"--seed: got {options.seed}; allowed: 0 or more")
-    if not options.seconds > 0.0:
-        parser.error(f"--seconds: got {options.seconds}; allowed: more than 0")
-    return options
+    seed: int = Field(0, ge=0, lt=2**63, description="of rallies and actions")
 
 
-def main() -> None:
+def main(config: EnvConfig, _stop: Event) -> int:
     """Measure and print."""
-    options = parse()
-    speed = measure(options.envs, options.noise, options.seconds, options.seed)
-    if options.json:
+    speed = measure(config.envs, config.randomization, config.seconds, config.seed)
+    if config.json_line:
         print(
             json.dumps(
                 {
@@ -132,19 +125,20 @@ def main() -> None:
                     "mujoco_steps_per_s": round(speed.mujoco_steps_per_s),
                     "ratio": round(speed.ratio, 4),
                     "substeps": speed.substeps,
-                    "envs": options.envs,
-                    "noise": options.noise,
-                    "seconds": options.seconds,
+                    "envs": config.envs,
+                    "randomization": config.randomization,
+                    "seconds": config.seconds,
                 }
             )
         )
     else:
         print(
             f"{speed.env_steps_per_s:,.0f} environment steps/s, {speed.ratio:.1%} of MuJoCo's own "
-            f"{speed.mujoco_steps_per_s:,.0f} ({options.envs} environments, {speed.substeps} substeps, "
-            f"noise {options.noise})"
+            f"{speed.mujoco_steps_per_s:,.0f} ({config.envs} environments, {speed.substeps} substeps, "
+            f"randomization {config.randomization})"
         )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("env", EnvConfig, main))

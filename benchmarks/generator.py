@@ -1,38 +1,42 @@
-"""How many valid rallies a second one core draws, flies, validates and puts through the codec.
+"""Valid rallies per second that one core draws, flies, validates and passes through the codec.
 
     python -m benchmarks.generator --json
 
-An actor consumes well under 1,000 rallies a second, so one generator should feed them all with room to spare.
+An actor uses fewer than 1,000 rallies per second, so one generator can supply many actors.
 """
 
-import argparse
 import json
+import sys
 import time
 from dataclasses import asdict, dataclass
+from threading import Event
 
+from pydantic import Field
+
+from benchmarks.settings import BenchmarkConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import RallyBatch
-from common.rally.launch import draw_rallies
-from common.rally.launch_presets import PRESETS
-from common.rally.noise import PROFILES
+from common.task.config import Randomization, TaskConfig
+from common.task.launch import draw_rallies
+from common.task.launch_presets import PresetName
 
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """What one run measured."""
+    """Result of one run."""
 
-    preset: str
-    noise: str
+    launch: str  # preset
+    randomization: str  # profile
     batch: int  # rallies per message
-    rallies: int  # valid ones, through the codec
+    rallies: int  # valid rallies that passed the codec
     candidates: int  # launches drawn for them
     bytes: int  # on the wire
     seconds: float
 
 
-def batch_on_the_wire(preset: str, noise: str, size: int, seed: int, block: int) -> tuple[RallyBatch, int]:
-    """Return a block of valid rallies as its receiver gets it, and its size [bytes]."""
-    drawn = draw_rallies(size, seed=seed, block=block, preset=preset, noise=noise)
+def batch_on_the_wire(task: TaskConfig, size: int, seed: int, block: int) -> tuple[RallyBatch, int]:
+    """Return a block of valid rallies as its receiver decodes it, and its size [bytes]."""
+    drawn = draw_rallies(size, task, seed=seed, block=block)
     message = RallyBatch(
         source="benchmark",
         incarnation=0,
@@ -42,77 +46,66 @@ def batch_on_the_wire(preset: str, noise: str, size: int, seed: int, block: int)
         rallies=drawn.launches,
         seeds=drawn.seeds,
         candidates=drawn.drawn,
-        preset=preset,
-        noise=noise,
+        launch=task.launch,
+        randomization=task.randomization,
     )
     payload = encode(message)
     return decode(payload, RallyBatch), len(payload)
 
 
-def measure(preset: str, noise: str, size: int, seed: int, seconds: float) -> Speed:
-    """Draw blocks for ``seconds`` and return how far that went."""
-    batch_on_the_wire(preset, noise, 1, seed, 0)  # compiles
+def measure(launch: str, randomization: str, size: int, seed: int, seconds: float) -> Speed:
+    """Draw blocks for ``seconds`` and return the number of rallies."""
+    task = TaskConfig.model_validate({"launch": launch, "randomization": randomization})
+    batch_on_the_wire(task, 1, seed, 0)  # compiles the kernels
     rallies = candidates = n_bytes = block = 0
     start = time.perf_counter()
     elapsed = 0.0
     while elapsed < seconds:
-        received, received_bytes = batch_on_the_wire(preset, noise, size, seed, block)
+        received, received_bytes = batch_on_the_wire(task, size, seed, block)
         rallies += len(received.seeds)
         candidates += received.candidates
         n_bytes += received_bytes
         block += 1
         elapsed = time.perf_counter() - start
-    return Speed(preset, noise, size, rallies, candidates, n_bytes, elapsed)
+    return Speed(launch, randomization, size, rallies, candidates, n_bytes, elapsed)
 
 
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.generator",
-        description="Measure the generator's core on one thread: draw random launches, fly each to its first "
-        "touch, keep those that cross the net and touch the robot's court first, encode and decode "
-        "the batch. No network, no process: what a generator could publish at best.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+class GeneratorConfig(BenchmarkConfig):
+    """Measure the generator's core on one thread: draw random launches, validate them, encode and decode the batch.
+
+    A launch is valid if the ball crosses the net and its first touch is the robot's court. There is no network and no
+    other process: the result is an upper bound for a generator.
+    """
+
+    launch: PresetName = Field("paper", description="launch preset")
+    randomization: Randomization = Field("standard", description="profile with the ranges of drag and lift")
+    batch: int = Field(500, ge=1, description="valid rallies per message")
+    seed: int = Field(0, ge=0, lt=2**63, description="of the blocks")
+    seconds: float = Field(
+        3.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
     )
-    parser.add_argument("--preset", choices=PRESETS, default="paper", help="which launches are drawn")
-    parser.add_argument("--noise", choices=PROFILES, default="standard", help="how far drag and lift vary")
-    parser.add_argument(
-        "--batch", type=int, default=500, metavar="N", help="valid rallies per message, 1 or more"
-    )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the blocks drawn, 0 or more")
-    parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="how long to measure, > 0")
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
-    options = parser.parse_args(arguments)
-    if options.batch < 1:
-        parser.error(f"--batch: got {options.batch}; allowed: 1 or more")
-    if options.seed < 0:
-        parser.error(f"--seed: got {options.seed}; allowed: 0 or more")
-    if not options.seconds > 0.0:
-        parser.error(f"--seconds: got {options.seconds}; allowed: more than 0")
-    return options
 
 
-def main() -> None:
+def main(config: GeneratorConfig, _stop: Event) -> int:
     """Measure and print."""
-    options = parse()
-    speed = measure(options.preset, options.noise, options.batch, options.seed, options.seconds)
+    speed = measure(config.launch, config.randomization, config.batch, config.seed, config.seconds)
     valid_per_s = speed.rallies / speed.seconds
     share = speed.rallies / speed.candidates
-    if options.json:
+    if config.json_line:
         figures = {
             "valid_per_s": round(valid_per_s),
             "yield": round(share, 4),
             "candidates_per_s": round(speed.candidates / speed.seconds),
             "bytes_per_rally": round(speed.bytes / speed.rallies, 1),
-            "launch": speed.preset,
         }
         print(json.dumps(figures | asdict(speed)))
     else:
         print(
             f"{valid_per_s:,.0f} valid rallies/s, {share:.1%} of the candidates "
-            f"({speed.preset}, noise {speed.noise}, {speed.rallies:,} in {speed.seconds:.1f} s)"
+            f"({speed.launch}, randomization {speed.randomization}, {speed.rallies:,} in {speed.seconds:.1f} s)"
         )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("generator", GeneratorConfig, main))

@@ -1,53 +1,57 @@
-"""How far the ball's physics is from recorded balls: tracks of a ball gun, with and without spin.
+"""Errors of the ball's physics on recorded balls: tracks of a ball gun, with and without spin.
 
     python -m benchmarks.physics_reality --json
 
-Every track is fitted (launch, spin, drag and lift factor) on what comes before its bounce; the rms of what is left
-is the fit's. Then parts are held back: the flight is fitted on its first 60 % and must land where the ball landed,
-and a fit on all of the flight must go on where the ball went after the bounce, on a table nobody fitted. The same is
-done with gravity and drag alone (``without_magnus``) and with gravity alone (``without_air``), and, with all of the
-air, on the other flight model. Medians over tracks; nothing is tuned to a track.
+Each track is fitted (launch, spin, drag and lift factor) on its samples before the bounce, and the rms of the residuals
+is the fit's error. Then parts are held out. The flight is fitted on its first 60 % and predicts the landing. A fit on
+all of the flight predicts the path after the bounce, on a nominal table that is not fitted. The same is done with
+gravity and drag alone (``without_magnus``), with gravity alone (``without_air``), and with all of the air on the other
+flight model. All figures are medians over tracks. Nothing is tuned to a track.
 """
 
-import argparse
 import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 from typing import Any, Final
 
 import numpy as np
+from pydantic import Field
 
+from benchmarks.settings import BenchmarkConfig, run
 from common.physics.constants import TABLE_FRICTION, TABLE_RESTITUTION0
 from common.physics.flight import FULL, SIMPLE
-from common.real2sim.bounces import Bounce, touches
-from common.real2sim.fit_problem import Air, FitOptions
-from common.real2sim.identify import Fit, fit
-from common.real2sim.predict import predict, touch_down
-from common.real2sim.recordings import load_folder
-from common.real2sim.tracks import FEWEST_SAMPLES, Array, RecordingError, Recordings, Track
+from common.task.config import FlightName
+from topspin.real2sim.fit.bounces import Bounce, touches
+from topspin.real2sim.fit.fit_problem import Air, FitOptions
+from topspin.real2sim.fit.identify import Fit, fit
+from topspin.real2sim.fit.predict import predict, touch_down
+from topspin.real2sim.formats.recordings import load_folder
+from topspin.real2sim.formats.tracks import FEWEST_SAMPLES, Array, RecordingError, Recordings, Track
 
-DATA: Final = Path("../shared/data/mpi_ball_gun")  # from the project, where the command is typed
+DATA: Final = Path("../shared/data/mpi_ball_gun")  # relative to the working directory
 LABELS: Final = ("topspin", "backspin", "no_spin")
-SEEN: Final = 0.6  # [-] share of the flight before the bounce that the landing is predicted from
-LONGEST: Final = 2.0  # s; of a predicted flight
-AFTER: Final = 0.1  # s; how long after its bounce a ball is compared
+FIRST_PART: Final = 0.6  # [-] share of the flight before the bounce from which the landing is predicted
+LONGEST: Final = 2.0  # [s] of a predicted flight
+AFTER: Final = 0.1  # [s] after its bounce, in which a ball is compared
 FLIGHTS: Final = {"simple": SIMPLE, "full": FULL}
 TABLE: Final = np.array([TABLE_RESTITUTION0, TABLE_FRICTION])
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What one track showed under one model [m]; nan where it can't be said."""
+    """Errors of one track under one model [m]; nan where there is none."""
 
     label: str
     fit_rms: float  # of the samples before the bounce
-    topspin: float  # [rad/s] of that fit, about the horizontal axis across the flight; below 0: backspin
+    topspin: float  # [rad/s] of that fit, around the horizontal axis across the flight; negative: backspin
     lift_factor: float  # [-] of that fit
-    landing: float  # where a ball fitted on the first part of the flight lands, and where it landed
-    landing_at_time: float  # where that ball is at the moment of the bounce, and where it bounced
-    after: float  # rms after the bounce of a ball that was fitted before it
+    landing: float  # distance of the landing from its prediction by a fit on the first part of the flight
+    landing_at_time: float  # distance of the bounce from that ball's position at the moment of the bounce
+    after: float  # rms after the bounce of a ball that was fitted on the flight before it
 
 
 def _distance(a: Sequence[float] | Array, b: Array) -> float:
@@ -63,10 +67,10 @@ def _flown(launch: Array, table: Array, times: Array, flight: int) -> Array:
 
 def _landing(track: Track, bounce: Bounce, options: FitOptions) -> tuple[float, float]:
     """Return the landing's two errors [m] of a fit on the first part of the flight."""
-    seen = int(np.searchsorted(track.times, SEEN * bounce.time, side="right"))
-    if seen < FEWEST_SAMPLES:
+    first = int(np.searchsorted(track.times, FIRST_PART * bounce.time, side="right"))
+    if first < FEWEST_SAMPLES:
         return np.nan, np.nan
-    part = fit(Track(track.id, track.times[:seen], track.positions[:seen], track.label), options)
+    part = fit(Track(track.id, track.times[:first], track.positions[:first], track.label), options)
     moment, place, _ = touch_down(part.launch, options.flight, LONGEST)
     there = _flown(part.launch, np.empty(0), np.array([bounce.time]), options.flight)[0]
     planar = _distance(place[:2], bounce.position[:2]) if np.isfinite(moment) else np.nan
@@ -74,7 +78,7 @@ def _landing(track: Track, bounce: Bounce, options: FitOptions) -> tuple[float, 
 
 
 def _after(track: Track, bounce: Bounce, end: int, whole: Fit) -> float:
-    """Return the rms [m] of the samples after the bounce, none of which was fitted."""
+    """Return the rms [m] of the samples after the bounce. None of them was fitted."""
     rows = np.arange(bounce.first_after, end)
     rows = rows[track.times[rows] <= bounce.time + AFTER]
     if not len(rows):
@@ -84,7 +88,7 @@ def _after(track: Track, bounce: Bounce, end: int, whole: Fit) -> float:
 
 
 def result_of(track: Track, air: Air, flight: int) -> Result:
-    """Return what a track shows under a model; raises RecordingError if it is too short."""
+    """Return the errors of a track under a model. Raises RecordingError if it is too short."""
     options = FitOptions(air=air, flight=flight, through_bounce=False)
     found = touches(track)
     whole = fit(track, options)
@@ -108,7 +112,7 @@ def result_of(track: Track, air: Air, flight: int) -> Result:
 
 
 def _median(values: Sequence[float], digits: int = 2, percentile: float = 50.0) -> float | None:
-    """Return a percentile of what is finite; None if nothing is."""
+    """Return a percentile of the finite values; None if there are none."""
     known = [value for value in values if np.isfinite(value)]
     return round(float(np.percentile(known, percentile)), digits) if known else None
 
@@ -178,34 +182,23 @@ def measure(recordings: Sequence[Recordings], flight: str) -> dict[str, Any]:
     }
 
 
-def parse(arguments: list[str] | None = None) -> argparse.Namespace:
-    """Return the command line's options."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.physics_reality",
-        description="Fit recorded tracks through the project's physics, and predict what is held back.",
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
-    parser.add_argument(
-        "--data", type=Path, default=DATA, metavar="FOLDER", help="*.hdf5 files of a ball gun"
-    )
-    parser.add_argument("--flight", choices=FLIGHTS, default="simple", help="model of the air")
-    parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
-    return parser.parse_args(arguments)
+class PhysicsRealityConfig(BenchmarkConfig):
+    """Fit recorded tracks through the project's physics, and predict the parts that are held out."""
+
+    data: Path = Field(DATA, description="folder with *.hdf5 files of a ball gun")
+    flight: FlightName = Field("simple", description="aerodynamics of the ball")
 
 
-def main() -> None:
+def main(config: PhysicsRealityConfig, _stop: Event) -> int:
     """Measure and print."""
-    options = parse()
-    try:
-        found = measure(load_folder(options.data, "*.hdf5"), options.flight)
-    except RecordingError as error:
-        raise SystemExit(f"physics_reality: {error}") from None
-    if options.json:
+    found = measure(load_folder(config.data, "*.hdf5"), config.flight)
+    if config.json_line:
         print(json.dumps(found))
-        return
-    for name, value in found.items():
-        print(f"{name:>36}  {value}")
+    else:
+        for name, value in found.items():
+            print(f"{name:>36}  {value}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run("physics_reality", PhysicsRealityConfig, main))

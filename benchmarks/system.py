@@ -1,28 +1,32 @@
-"""How fast is a whole run, end to end, and does its ledger balance? (`python -m benchmarks.system --json`).
+"""Speed of a whole run with learning, and the balance of its ledger.
 
-Starts a real run with `deploy.local`'s own topology, learning on, lets it warm up, and watches it for a while.
+    python -m benchmarks.system --json
+
+It starts a real run with the topology of `deploy.local`, lets it warm up, and measures it for a while.
 """
 
-import argparse
 import json
 import os
 import shutil
 import sys
 import time
-from pathlib import Path
+from threading import Event
 from typing import Any
 
 import psutil
+from pydantic import Field
 
+from benchmarks.settings import BenchmarkConfig, run
 from common.comms.codec import decode
 from common.comms.keys import Keys
 from common.comms.messages import Status
-from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.run_folder import RunFolder, whole_rows
+from common.errors import ReportedError
+from common.service.process import DONE
+from common.service.run_folder import LATEST, RUNS, whole_rows
 from deploy.config import DeployConfig
-from deploy.local import load_endpoint, prepared, specs
-from deploy.processes import Family
+from deploy.prepare import PreparedRun, prepared
+from deploy.supervisor import Supervisor
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 
@@ -32,29 +36,24 @@ def cpu_seconds(processes: list[psutil.Process]) -> float:
     return sum(sum(process.cpu_times()[:2]) for process in processes)
 
 
-def measure(config: DeployConfig, warm_up_s: float, seconds: float) -> dict[str, Any]:
-    """Return the figures of one run."""
-    with prepared(config) as (run, folder, config_file):
-        return measure_prepared(config, run, folder, config_file, warm_up_s, seconds)
-
-
-def measure_prepared(
-    config: DeployConfig, run: str, folder: RunFolder, config_file: Path, warm_up_s: float, seconds: float
-) -> dict[str, Any]:
-    """Return the figures of the run that `prepared` gave."""
-    family = Family(specs(config, config_file), folder.logs)
+def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> dict[str, Any]:
+    """Return the figures of a run."""
+    folder = run.folder
+    supervisor = Supervisor(run.specs(), folder.logs)
     transport = None
     learner: Status | None = None
     try:
-        transport = open_zenoh(ZenohConfig(endpoint=load_endpoint(config_file)))
-        statuses = transport.subscribe(Keys(run).every_status(), capacity=4096)
+        transport = open_zenoh(run.link, stop)
+        statuses = transport.subscribe(Keys(run.name).every_status(), capacity=4096)
 
         def watch(until: float) -> None:
             nonlocal learner
             while time.monotonic() < until:
-                family.watch(time.monotonic())
-                if family.status_of("learner-0") is not None:
-                    raise SystemExit(f"the learner ended early: see {folder.logs / 'learner-0.log'}")
+                if stop.is_set():
+                    raise ReportedError("stopped before it was done")
+                supervisor.watch(time.monotonic())
+                if supervisor.status_of("learner-0") is not None:
+                    raise ReportedError(f"the learner ended early: see {folder.logs / 'learner-0.log'}")
                 for sample in statuses.poll():
                     status = decode(sample.payload, Status)
                     if status.role == "learner":
@@ -64,16 +63,16 @@ def measure_prepared(
         deadline = time.monotonic() + 120.0
         while learner is None or learner.counters["trained"] == 0:
             if time.monotonic() > deadline:
-                raise SystemExit(f"nothing was trained within 120 s: see {folder.logs}")
+                raise ReportedError(f"nothing was trained within 120 s: see {folder.logs}")
             watch(time.monotonic() + 0.5)
         watch(time.monotonic() + warm_up_s)
-        processes = [psutil.Process(child.process.pid) for child in family.children.values()]
+        processes = [psutil.Process(child.process.pid) for child in supervisor.children.values()]
         before, cpu_before, started = learner, cpu_seconds(processes), time.monotonic()
         watch(started + seconds)
         cpu, wall, after = cpu_seconds(processes) - cpu_before, time.monotonic() - started, learner
     finally:
-        family.stop([name for name in family.children if name != "learner-0"], 10.0)
-        family.stop(["learner-0"], 30.0)
+        supervisor.stop([name for name in supervisor.children if name != "learner-0"], 10.0)
+        supervisor.stop(["learner-0"], 30.0)
         if transport is not None:
             transport.close()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -81,7 +80,7 @@ def measure_prepared(
     window = [
         row for row in rows if before.counters["frames"] < float(row["frames"]) <= after.counters["frames"]
     ]
-    # Heartbeats carry the learner's own clock: the frames between two of them over the time between them.
+    # A heartbeat has the learner's own clock: the rate is frames / time between two of them
     span = after.time - before.time
     result = {
         "frames_per_s": round((after.counters["frames"] - before.counters["frames"]) / span, 1),
@@ -90,9 +89,9 @@ def measure_prepared(
         "published": int(after.counters["published"]),
         **{fate: int(after.counters[fate]) for fate in FATES},
         "unaccounted": int(after.counters["published"] - sum(after.counters[fate] for fate in FATES)),
-        "restarts": sum(child.restarts for child in family.children.values()),
+        "restarts": sum(child.restarts for child in supervisor.children.values()),
         "epochs": len(window),
-        "actors": config.actors,
+        "actors": run.config.actors,
         "cores": cores,
         "cpu_seconds": round(cpu, 1),
         "seconds": round(wall, 1),
@@ -100,30 +99,37 @@ def measure_prepared(
     return result
 
 
-def main() -> int:
-    """Run from the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.system", description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object, last line")
-    parser.add_argument(
-        "--seconds", type=float, default=60.0, help="length of the measurement [s] (default 60)"
+class SystemConfig(BenchmarkConfig):
+    """Measure a whole run with learning: frames per second, idle share of the cores, policy lag, lost rollouts."""
+
+    seconds: float = Field(
+        60.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
     )
-    parser.add_argument(
-        "--warm-up", type=float, default=10.0, help="time between the first trained batch and it [s]"
+    warm_up: float = Field(
+        10.0,
+        ge=0,
+        description="time between the first trained dataset and the measurement",
+        json_schema_extra={"unit": "s"},
     )
-    parser.add_argument("--actors", type=int, default=DeployConfig().actors, help="actor processes")
-    parser.add_argument("--keep", action="store_true", help="keep the run folder")
-    arguments = parser.parse_args()
-    config = DeployConfig(
-        run=time.strftime("benchmark-%Y%m%d-%H%M%S"), actors=arguments.actors, evaluate=False, panel="off"
-    )
-    result = measure(config, arguments.warm_up, arguments.seconds)
-    if not arguments.keep:
-        shutil.rmtree(Path("runs") / config.run, ignore_errors=True)
-    for name, value in result.items():
-        print(f"{name:>16} {value}", file=sys.stderr)
-    print(json.dumps(result) if arguments.json else "")
-    return 0
+    actors: int = Field(DeployConfig().actors, ge=1, le=1000, description="actor processes")
+    keep: bool = Field(False, description="keep the run folder")
+
+
+def main(config: SystemConfig, stop: Event) -> int:
+    """Measure and print."""
+    name = time.strftime("benchmark-%Y%m%d-%H%M%S")
+    with prepared(DeployConfig(run=name, actors=config.actors, evaluate=False, panel="off")) as prepared_run:
+        result = measure(prepared_run, config.warm_up, config.seconds, stop)
+    if not config.keep:
+        shutil.rmtree(prepared_run.folder.root, ignore_errors=True)
+        if not (RUNS / LATEST).exists():  # the link to the folder that is gone
+            (RUNS / LATEST).unlink(missing_ok=True)
+    for key, value in result.items():
+        print(f"{key:>16} {value}", file=sys.stderr)
+    if config.json_line:
+        print(json.dumps(result))
+    return DONE
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run("system", SystemConfig, main))

@@ -10,8 +10,10 @@ Units
 Arrays
     Batch first. Physics float64 ``(..., 3)``; rollouts float32 ``[T, B]``; quaternions (w, x, y, z), w >= 0.
 Layers
-    deploy -> services -> common, never back. ``common.physics`` and ``common.rally`` are pure: numpy and
-    numba only. Each edge library lives in one place: msgpack in ``comms/codec.py``, Zenoh in
-    ``comms/zenoh_transport.py``, Prometheus in ``metrics.py``, MuJoCo in ``env/``, its renderer with OpenGL, PIL and
-    ffmpeg in ``render/``, torch in ``policy/`` and the learner.
+    Imports go down only: topspin > deploy > services > common. Services never import each other. Inside common:
+    evaluation > env > rally > perception, policy > task > service > comms, physics > jit, errors.
+    ``physics``, ``task``, ``perception`` and ``rally`` use numpy and numba, and pydantic for settings. Other
+    libraries have one place each: msgpack in ``comms/codec.py``, Zenoh in ``comms/zenoh_transport.py``, Prometheus
+    in ``service/metrics.py``, MuJoCo in ``env/`` (its renderer in ``topspin/render/``), torch in ``policy/``, the
+    learner and the actor. Plots, pages, films, fits and Gymnasium are in ``topspin/`` alone.
 """

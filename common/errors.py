@@ -1,5 +1,5 @@
-"""The root of errors that a person can do something about."""
+"""The base class of errors that a user can fix."""
 
 
 class ReportedError(Exception):
-    """Ends a program with one line that names what was got and what is allowed, and no traceback."""
+    """Ends a program with one line, without a traceback: what was given, and what is allowed."""

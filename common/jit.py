@@ -9,26 +9,35 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import numba
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
-_COMMON = Path(__file__).parent
+_ROOT = Path(__file__).parents[1]
+KERNEL_ROOMS: Final = (
+    "common/physics",
+    "common/task",
+    "common/perception",
+    "common/rally",
+    "common/env",
+    "common/evaluation",
+    "topspin/real2sim",
+)
+"""Folders with kernels; a test finds every ``@kernel`` and checks that its folder is here."""
 
 
 def _source_digest() -> str:
     digest = hashlib.sha256(numba.__version__.encode())
-    folders = ("physics", "rally", "env", "real2sim")
-    for path in sorted(path for folder in folders for path in _COMMON.glob(f"{folder}/*.py")):
+    for path in sorted(path for folder in KERNEL_ROOMS for path in _ROOT.glob(f"{folder}/**/*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
     # numba makes its settings attributes when it is imported
-    numba.config.CACHE_DIR = str(_COMMON.parent / ".numba_cache" / _source_digest())  # type: ignore[attr-defined]
+    numba.config.CACHE_DIR = str(_ROOT / ".numba_cache" / _source_digest())  # type: ignore[attr-defined]
 
 
 def kernel(function: _Kernel) -> _Kernel:

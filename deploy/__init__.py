@@ -1,1 +1,1 @@
-"""How the processes are put together."""
+"""How the processes of a run are started and watched."""

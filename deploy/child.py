@@ -1,10 +1,10 @@
-"""`python -m deploy.child MODULE [flags]`: run a service that ends when whoever started it is gone.
+"""`python -m deploy.child MODULE [flags]`: run a service that ends when its parent process ends.
 
-Its standard input is a pipe that the parent holds open. When the parent ends, however it ends, the pipe closes: the
-service is asked to stop, and made to if it doesn't. So no process of a run is left behind.
+Its standard input is a pipe that the parent holds open. When the parent ends, also after a crash, the pipe closes. The
+service then gets SIGTERM, and is ended if it does not stop. So no process of a run stays alive.
 
-`python -m deploy.child --spare MODULE` imports what takes seconds and waits: the line that then comes down the pipe
-(`Assignment`) says whose place it takes. So a killed actor is back as soon as its environments are.
+`python -m deploy.child --spare MODULE` imports the slow modules and waits. A line in the pipe (`Assignment`) then says
+which process it replaces. So a killed actor plays again as soon as its environments are ready.
 """
 
 import importlib
@@ -25,13 +25,13 @@ SPARE: Final = "--spare"
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """Whose place a spare process takes."""
+    """The process that a spare one replaces."""
 
-    log: str  # file that its output goes to
+    log: str  # file for its output
     arguments: tuple[str, ...]  # flags of the service
 
     def to_line(self) -> bytes:
-        """Return what goes down the pipe."""
+        """Return the line for the pipe."""
         return json.dumps(asdict(self)).encode() + b"\n"
 
     @classmethod
@@ -55,7 +55,7 @@ def follow_parent() -> None:
 
 
 def wait_for_assignment(module: str) -> Assignment:
-    """Return the place to take, once it is free; ends the process if the parent ends before."""
+    """Wait for an assignment and return it; end this process if the parent ends before."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     importlib.import_module(f"{module}.service")
     line = b""
@@ -77,7 +77,7 @@ def main() -> None:
         log = os.open(place.log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
         for output in (1, 2):
             os.dup2(log, output)
-    with suppress(OSError):  # Linux only: what top shows
+    with suppress(OSError):  # Linux only: the name in top
         Path("/proc/self/comm").write_text(f"topspin {module.rpartition('.')[2]}"[:15])
     sys.argv = [module, *arguments]
     follow_parent()

@@ -1,4 +1,4 @@
-"""The live terminal panel: what a run is doing, from the heartbeats of its services."""
+"""The live terminal panel: the state of a run, from the heartbeats of its services."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -27,13 +27,13 @@ class View:
     frames: int = 0
 
     def hear(self, status: Status, now: float) -> None:
-        """Take a heartbeat in."""
+        """Store a heartbeat."""
         self.statuses[status.role, status.id] = status
         self.heard[status.role, status.id] = now
 
 
 def share_done(view: View) -> float:
-    """Return how much of the budget is spent, 0..1: the limit that is nearest to its end decides."""
+    """Return how much of the budget is spent, 0..1: the limit with the largest share decides."""
     learner = view.statuses.get(("learner", "0"))
     if learner is None:
         return 0.0
@@ -127,15 +127,15 @@ def render(view: View, now: float) -> RenderableType:
         Text(f"lost {counters.get('lost', 0):.0f}", style="red" if counters.get("lost", 0) else ""),
     )
 
-    who = Table(box=None, padding=(0, 2), header_style="dim")
+    processes = Table(box=None, padding=(0, 2), header_style="dim")
     for title in ("process", "state", "doing", "heard", "restarts"):
-        who.add_column(title)
+        processes.add_column(title)
     for (role, id_), status in sorted(view.statuses.items()):
         name = f"{role}-{id_}"
         silence = now - view.heard[role, id_]
         style = "red" if silence > STALE_S else ""
-        who.add_row(
-            Text(name),  # as it is: names and states come from others, and brackets are markup
+        processes.add_row(
+            Text(name),  # plain text: a name or state may hold brackets, which would be markup
             Text(status.state),
             _doing(status),
             f"{silence:.0f} s ago",
@@ -143,7 +143,7 @@ def render(view: View, now: float) -> RenderableType:
             style=style,
         )
     bar = ProgressBar(total=1.0, completed=share_done(view), width=60)
-    rows: list[RenderableType] = [head, bar, Text(""), play, Text(""), learning, ledger, Text(""), who]
+    rows: list[RenderableType] = [head, bar, Text(""), play, Text(""), learning, ledger, Text(""), processes]
     return Panel(Group(*rows), title=f"Topspin {view.run}", border_style="cyan", padding=(0, 1))
 
 

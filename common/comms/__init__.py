@@ -1,1 +1,1 @@
-"""Messages and the transports they travel over."""
+"""Messages, and the transports that carry them."""

@@ -1,9 +1,9 @@
-"""Messages to bytes and back: the only file that knows msgpack.
+"""Encoding of messages as bytes, and decoding. Only this file uses msgpack.
 
-A message on the wire is ``b"TSPN" | crc32 of the body | length of the body | body``, all little endian; the
-body is the msgpack array ``[type, version, {field: value}]``, in which an array is ``[dtype, shape, bytes]``.
-The checksum tells corruption from bad form; decoding checks everything that the message's fields declare, so
-that behind it nobody has to. Decoded arrays are read-only.
+A message on the wire is ``b"TSPN" | crc32 of the body | length of the body | body``, all little endian. The
+body is the msgpack array ``[type, version, {field: value}]``. In it an array is ``[dtype, shape, bytes]``.
+The checksum separates corrupt bytes from a wrong format. Decoding checks everything that the message's fields
+declare, so the receiver needs no checks of its own. Decoded arrays are read-only.
 
     @dataclass(frozen=True, slots=True, eq=False)
     class Rollout:
@@ -34,11 +34,11 @@ _MAX_ITEMS: Final = 65_536  # of one msgpack array or map; arrays of numbers tra
 
 
 class DecodeError(ValueError):
-    """Bytes that are not the message they should be: the field, what was got, what is allowed."""
+    """Bytes that are not the expected message. The text names the field, what was got and what is allowed."""
 
 
 class EncodeError(ValueError):
-    """A message whose fields are not what it declares."""
+    """A message whose fields differ from their declaration."""
 
 
 _M = TypeVar("_M", bound=Message)
@@ -46,7 +46,7 @@ _N = TypeVar("_N", bound=Message)
 
 
 def encode(message: Message) -> bytes:
-    """Return the bytes of a message. Raises EncodeError where a field is not what the message declares."""
+    """Return the bytes of a message. Raises EncodeError if a field differs from its declaration."""
     kind = type(message)
     fields = _pack_fields(message, kind.__name__, Dims())
     try:
@@ -57,7 +57,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(payload: bytes, expected: type[_M], *, limit_bytes: int = DEFAULT_LIMIT_BYTES) -> _M:
-    """Return the message in ``payload``, checked. Raises DecodeError, and nothing else, for any bytes."""
+    """Return the checked message in ``payload``. For any bytes it raises DecodeError or nothing."""
     return typing.cast(_M, _decode(payload, (expected,), limit_bytes))
 
 
@@ -70,7 +70,7 @@ def decode_one_of(
 def decode_one_of(
     payload: bytes, expected: tuple[type[Message], ...], *, limit_bytes: int = DEFAULT_LIMIT_BYTES
 ) -> Any:
-    """Return the message in ``payload``, which may be of any of these types; otherwise as `decode`."""
+    """Return the message in ``payload``, of one of these types. Apart from that it is `decode`."""
     return _decode(payload, expected, limit_bytes)
 
 
@@ -87,16 +87,17 @@ def _decode(payload: bytes, expected: tuple[type[Message], ...], limit_bytes: in
         raise DecodeError(f"got a message of type {_short(got_type)}; allowed here: {names}")
     if type(got_version) is not int or got_version != kind.VERSION:
         raise DecodeError(
-            f"{got_type}: version {_short(got_version)}; this side speaks {kind.VERSION}: "
+            f"{got_type}: version {_short(got_version)}; allowed: {kind.VERSION}: "
             "run the same release everywhere"
         )
     return _read_fields(fields, kind, kind.__name__, Dims())
 
 
 def salvage(payload: bytes, expected: type[_M], names: tuple[str, ...]) -> dict[str, Any]:
-    """Return those of the named plain fields that can be read although the message as a whole can't be.
+    """Return the readable ones of the named plain fields of a message that is invalid as a whole.
 
-    So that the sender of a rollout with a NaN can be told which one it was. Empty if the bytes are corrupt.
+    With them the learner can answer the sender of a rollout with a NaN, and name the rollout. Empty if the bytes are
+    corrupt.
     """
     try:
         content = _unpack(_body(payload, expected.__name__), expected.__name__)
@@ -118,9 +119,7 @@ def _body(payload: bytes, name: str) -> memoryview:
         raise DecodeError(f"{name}: starts with {magic!r}, not with {MAGIC!r}: not a Topspin message")
     body = memoryview(payload)[_HEADER.size :]
     if len(body) != length:
-        raise DecodeError(
-            f"{name}: a body of {len(body)} bytes where the header says {length}: cut or joined"
-        )
+        raise DecodeError(f"{name}: a body of {len(body)} bytes, the header says {length}: cut or joined")
     if zlib.crc32(body) != checksum:
         raise DecodeError(f"{name}: corrupt: checksum {zlib.crc32(body):08x}, the header says {checksum:08x}")
     return body
@@ -129,7 +128,7 @@ def _body(payload: bytes, name: str) -> memoryview:
 def _unpack(body: memoryview, name: str) -> Any:
     try:
         return msgpack.unpackb(body, max_array_len=_MAX_ITEMS, max_map_len=_MAX_ITEMS, ext_hook=_no_extension)
-    # msgpack documents ValueError and its own family; nesting and odd keys give the others
+    # msgpack documents ValueError and its own exceptions; deep nesting and unusual keys raise the others
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise DecodeError(
             f"{name}: the body is not msgpack: {type(error).__name__} {error}".strip()
@@ -140,7 +139,7 @@ def _no_extension(code: int, _data: bytes) -> Any:
     raise ValueError(f"extension type {code}")
 
 
-# ---- to the wire
+# ---- encoding
 
 
 def _pack_fields(message: Any, path: str, dims: Dims) -> dict[str, Any]:
@@ -177,7 +176,7 @@ def _pack_array(value: Any, wire: Wire, path: str, dims: Dims) -> list[Any]:
     return [wire.dtype, list(value.shape), value.tobytes()]
 
 
-# ---- from the wire
+# ---- decoding
 
 
 def _read_fields(raw: dict[Any, Any], kind: type, path: str, dims: Dims) -> Any:
@@ -259,7 +258,7 @@ def _read_array(raw: Any, wire: Wire, path: str, dims: Dims) -> Any:
         raise DecodeError(f"{path}: {got}; allowed: {size} bytes for shape {tuple(shape)}")
     if wire.dtype == "|b1":
         _check_values(np.frombuffer(content, np.uint8).reshape(shape), Wire(low=0, high=1), path)
-    # frombuffer on bytes is read-only, and costs no copy
+    # frombuffer on bytes gives a read-only array and makes no copy
     array = np.frombuffer(content, dtype=np.dtype(wire.dtype)).reshape(shape)
     if wire.dtype != "|b1":
         _check_values(array, wire, path)

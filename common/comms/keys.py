@@ -1,10 +1,10 @@
-"""Every key the services use, and how a key expression matches a key.
+"""All keys of the services, and the matching of key expressions with keys.
 
-topspin/v1/<run>/policy                          latest policy: put as a hint, late joiners ask for it
-topspin/v1/<run>/stage                           stage changes: put as a hint, upon which an actor asks for the
-                                                 policy, which says its stage; all of them for whoever asks
-topspin/v1/<run>/rollout                         rollouts: requests to the learner, the verdict is the reply
-topspin/v1/<run>/rally/<shard>                   valid rallies: put in batches, or asked for by index
+topspin/v1/<run>/policy                          latest policy: put as a hint; late joiners request it
+topspin/v1/<run>/stage                           stage changes: put as a hint; an actor then requests the policy,
+                                                 which contains its stage. A request returns all changes
+topspin/v1/<run>/rollout                         rollouts: requests to the learner; the reply is the verdict
+topspin/v1/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
 topspin/v1/<run>/ctl/<role>/<id>                 commands to one service; actors' reports to the learner
 topspin/v1/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
 topspin/v1/<run>/status/<role>/<id>              heartbeats with cumulative counters
@@ -14,20 +14,22 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
+from common.errors import ReportedError
+
 PREFIX: Final = "topspin/v1"
 ROLES: Final = ("generator", "actor", "learner", "evaluator")
 
-# Neither wildcards (* $ # ?), separators (/) nor Zenoh's verbatim mark (@) can stand in a part.
+# A part contains no wildcard (* $ # ?), no separator (/) and not Zenoh's verbatim mark (@).
 _PART: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-class KeyPartError(ValueError):
-    """A run, role, id or number that can't stand in a key."""
+class KeyPartError(ReportedError, ValueError):
+    """A run, role, id or number that is not allowed in a key."""
 
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One life of one service, as its liveliness token names it."""
+    """One incarnation of one service, as named by its liveliness token."""
 
     role: str
     id: str
@@ -36,7 +38,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """The keys of one run. Raises KeyPartError for a name that can't stand in a key."""
+    """The keys of one run. Raises KeyPartError for a name that is not allowed in a key."""
 
     run: str
 
@@ -52,7 +54,7 @@ class Keys:
         return f"{PREFIX}/{self.run}/stage"
 
     def rollout(self) -> str:
-        """Return the key that rollouts are sent to."""
+        """Return the key for rollouts."""
         return f"{PREFIX}/{self.run}/rollout"
 
     def rally(self, shard: int) -> str:
@@ -64,9 +66,9 @@ class Keys:
         return f"{PREFIX}/{self.run}/ctl/{_role(role)}/{_part('id', id_)}"
 
     def alive(self, role: str, id_: str, incarnation: int) -> str:
-        """Return the key of the liveliness token of one life of a service."""
-        life = _number("incarnation", incarnation)
-        return f"{PREFIX}/{self.run}/alive/{_role(role)}/{_part('id', id_)}/{life}"
+        """Return the key of the liveliness token of one incarnation of a service."""
+        number = _number("incarnation", incarnation)
+        return f"{PREFIX}/{self.run}/alive/{_role(role)}/{_part('id', id_)}/{number}"
 
     def every_alive(self) -> str:
         """Return the expression that matches all liveliness tokens of the run."""
@@ -81,7 +83,7 @@ class Keys:
         return f"{PREFIX}/{self.run}/status/**"
 
     def member(self, alive_key: str) -> Member:
-        """Return who a liveliness key of this run belongs to."""
+        """Return the owner of a liveliness key of this run."""
         head, _, rest = alive_key.partition(f"{PREFIX}/{self.run}/alive/")
         parts = rest.split("/")
         if head or len(parts) != 3 or not parts[2].isdigit():
@@ -92,7 +94,7 @@ class Keys:
 
 
 def matches(key_expr: str, key: str) -> bool:
-    """Return whether ``key`` is one of ``key_expr``: ``*`` stands for one chunk, ``**`` for any number."""
+    """Return whether ``key_expr`` matches ``key``: ``*`` matches one chunk, ``**`` any number of chunks."""
     return _chunks_match(key_expr.split("/"), key.split("/"))
 
 

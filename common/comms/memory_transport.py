@@ -1,7 +1,8 @@
-"""The transport between services of one process, with a hub that can go away and links that can be cut.
+"""The transport between services of one process, with a hub that can close and links that can be cut.
 
-Not a mock: tests and single-process runs use it, and the contract suite holds it to what Zenoh does. In
-particular a client without a link loses its puts in silence, gets NO_SERVER at once and sees all tokens go.
+It is not a mock: tests and single-process runs use it, and the contract suite requires the same behaviour as from
+Zenoh. For example, without a link a client loses its puts without an error, gets NO_SERVER at once and sees all
+tokens end.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ from common.comms.transport import (
 
 @dataclass(slots=True, eq=False)
 class _Declared:
-    """Something that one transport declared on a key expression."""
+    """A declaration of one transport on a key expression."""
 
     owner: "MemoryTransport"
     key_expr: str
@@ -45,8 +46,8 @@ class _Subscriber(_Declared):
 
 
 @dataclass(slots=True, eq=False)
-class _Servant(_Declared):
-    inbox: Mailbox["_Question"]
+class _Queryable(_Declared):
+    inbox: Mailbox["_Query"]
 
 
 @dataclass(slots=True, eq=False)
@@ -57,15 +58,15 @@ class _Token(_Declared):
 @dataclass(slots=True, eq=False)
 class _Watcher(_Declared):
     inbox: Mailbox[AliveEvent]
-    seen: set[str] = field(default_factory=set)
+    alive: set[str] = field(default_factory=set)
 
 
 @dataclass(slots=True, eq=False)
-class _Question:
-    """A request on its way between two transports."""
+class _Query:
+    """A request in progress between two transports."""
 
-    asker: "MemoryTransport"
-    servant: _Servant
+    client: "MemoryTransport"
+    queryable: _Queryable
     key: str
     payload: bytes
     pending: PendingReply
@@ -73,7 +74,7 @@ class _Question:
 
 @dataclass(slots=True)
 class _Link:
-    """Whether a transport is tied to the hub, and how often it came back."""
+    """Whether a transport is connected to the hub, and how often it connected."""
 
     is_cut: bool = False
     up: bool = False
@@ -84,98 +85,98 @@ _Kind = TypeVar("_Kind", bound=_Declared)
 
 
 class MemoryBroker:
-    """What the transports of one process share. The first `open` must be the hub, as with processes."""
+    """The state that the transports of one process share. The first `open` must be the hub, as with processes."""
 
     def __init__(self) -> None:
         self._lock = RLock()
         self._hub: MemoryTransport | None = None
         self._links: dict[MemoryTransport, _Link] = {}
         self._declared: list[_Declared] = []
-        self._questions: list[_Question] = []
+        self._queries: list[_Query] = []
 
     def open(self, *, hub: bool = False, max_message_bytes: int = MAX_MESSAGE_BYTES) -> "MemoryTransport":
         """Return a new transport. Raises TransportError for a second hub, or a client without a hub."""
         with self._lock:
             if hub and self._hub is not None:
-                raise TransportError("the broker has a hub already: close it before another is opened")
+                raise TransportError("the broker has a hub already: close it before you open another")
             if not hub and self._hub is None:
                 raise TransportError("the broker has no hub: open one with hub=True first")
             transport = MemoryTransport(self, max_message_bytes)
             self._links[transport] = _Link()
             if hub:
                 self._hub = transport
-            self._settle()
+            self._update()
             return transport
 
     def cut(self, transport: "MemoryTransport") -> None:
-        """Break the link of one client, as a network or a frozen process would."""
+        """Break the link of one client, as a network failure or a hung process does."""
         with self._lock:
             self._links[transport].is_cut = True
-            self._settle()
+            self._update()
 
     def mend(self, transport: "MemoryTransport") -> None:
-        """Bring the link of one client back."""
+        """Restore the link of one client."""
         with self._lock:
             self._links[transport].is_cut = False
-            self._settle()
+            self._update()
 
-    # What follows is the transports' side of it.
+    # Only transports call the methods that follow.
 
     def leave(self, transport: "MemoryTransport") -> None:
-        """Take a transport and all it declared out."""
+        """Remove a transport and all its declarations."""
         with self._lock:
             if self._hub is transport:
                 self._hub = None
             self._links.pop(transport, None)
             self._declared = [entry for entry in self._declared if entry.owner is not transport]
-            self._settle()
+            self._update()
 
     def link(self, transport: "MemoryTransport") -> _Link:
-        """Return the state of a transport's link; a closed one's is down."""
+        """Return the state of a transport's link. The link of a closed transport is down."""
         with self._lock:
             return self._links.get(transport, _Link())
 
     def declare(self, entry: _Declared) -> None:
-        """Make something reachable for the others."""
+        """Add a declaration, so that the others reach it."""
         with self._lock:
             self._declared.append(entry)
-            self._settle()
+            self._update()
 
     def withdraw(self, entry: _Declared) -> None:
-        """Undo `declare`; twice is allowed."""
+        """Remove a declaration. A second call has no effect."""
         with self._lock:
             self._declared = [other for other in self._declared if other is not entry]
-            self._settle()
+            self._update()
 
     def subscribers(self, transport: "MemoryTransport", key: str) -> list[_Subscriber]:
-        """Return who would get a put of ``transport`` on ``key`` now."""
+        """Return the subscribers that a put of ``transport`` on ``key`` reaches now."""
         with self._lock:
             return list(self._reachable(_Subscriber, transport, key))
 
     def put(self, transport: "MemoryTransport", sample: Sample) -> None:
-        """Deliver a put to whoever subscribes now."""
+        """Deliver a put to all current subscribers."""
         with self._lock:
             for entry in self._reachable(_Subscriber, transport, sample.key):
                 entry.inbox.put(sample)
 
-    def ask(self, transport: "MemoryTransport", key: str, payload: bytes, pending: PendingReply) -> None:
-        """Hand a request to one server of ``key``, or end it."""
+    def request(self, transport: "MemoryTransport", key: str, payload: bytes, pending: PendingReply) -> None:
+        """Give a request to one server of ``key``, or end it."""
         with self._lock:
-            servant = next(self._reachable(_Servant, transport, key), None)
-            if servant is None:
+            queryable = next(self._reachable(_Queryable, transport, key), None)
+            if queryable is None:
                 pending.settle(NoReply.NO_SERVER)
                 return
-            question = _Question(transport, servant, key, payload, pending)
-            self._questions.append(question)
-            if not servant.inbox.put(question):
-                self.answer(question, None)
+            query = _Query(transport, queryable, key, payload, pending)
+            self._queries.append(query)
+            if not queryable.inbox.put(query):
+                self.answer(query, None)
 
-    def answer(self, question: _Question, payload: bytes | None) -> None:
-        """End a request: with an answer, or without one."""
+    def answer(self, query: _Query, payload: bytes | None) -> None:
+        """End a request, with or without an answer."""
         with self._lock:
-            if question in self._questions:  # else its link broke meanwhile, and it has ended
-                self._questions.remove(question)
-                question.pending.settle(NoReply.NO_SERVER if payload is None else Reply(payload))
+            if query in self._queries:  # if it is not there, its link broke before, and the request has ended
+                self._queries.remove(query)
+                query.pending.settle(NoReply.NO_SERVER if payload is None else Reply(payload))
 
     def _reach(self, a: "MemoryTransport", b: "MemoryTransport") -> bool:
         return a in self._links and b in self._links and (a is b or (self._links[a].up and self._links[b].up))
@@ -187,26 +188,26 @@ class MemoryBroker:
             if self._reach(transport, entry.owner):
                 yield entry
 
-    def _settle(self) -> None:
-        """Bring everybody up to date after any change: links, tokens in sight, requests under way."""
+    def _update(self) -> None:
+        """Apply a change to links, visible tokens and requests in progress."""
         for link in self._links.values():
             up = self._hub is not None and not link.is_cut
             link.times_up += up and not link.up
             link.up = up
         tokens = [entry for entry in self._declared if isinstance(entry, _Token)]
         for watcher in [entry for entry in self._declared if isinstance(entry, _Watcher)]:
-            in_sight = {
+            visible = {
                 token.key_expr
                 for token in tokens
                 if matches(watcher.key_expr, token.key_expr) and self._reach(watcher.owner, token.owner)
             }
-            for key in sorted(in_sight ^ watcher.seen):
-                watcher.inbox.put(AliveEvent(key=key, alive=key in in_sight))
-            watcher.seen = in_sight
-        for question in list(self._questions):
-            servant = question.servant
-            if servant not in self._declared or not self._reach(question.asker, servant.owner):
-                self.answer(question, None)
+            for key in sorted(visible ^ watcher.alive):
+                watcher.inbox.put(AliveEvent(key=key, alive=key in visible))
+            watcher.alive = visible
+        for query in list(self._queries):
+            queryable = query.queryable
+            if queryable not in self._declared or not self._reach(query.client, queryable.owner):
+                self.answer(query, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +216,7 @@ class _MemoryToken:
 
 
 class MemoryTransport:
-    """One service's connection to a `MemoryBroker`; `Transport` says what its methods promise."""
+    """One service's connection to a `MemoryBroker`. `Transport` documents its methods."""
 
     def __init__(self, broker: MemoryBroker, max_message_bytes: int) -> None:
         self._broker = broker
@@ -231,17 +232,17 @@ class MemoryTransport:
 
     @property
     def reconnect_count(self) -> int:
-        """How often the link came back."""
+        """How often the link was restored."""
         return max(0, self._broker.link(self).times_up - 1)
 
     def publish(self, key: str, payload: bytes, flow: Flow) -> None:
-        """Send to whoever subscribes now."""
+        """Send to all current subscribers."""
         self._check_open()
         check_size(key, payload, self._max_message_bytes)
         self._broker.put(self, Sample(key=key, payload=payload))
 
     def matching(self, key: str, flow: Flow) -> bool:
-        """Return whether somebody subscribes to ``key`` now."""
+        """Return whether ``key`` has a subscriber now."""
         self._check_open()
         return bool(self._broker.subscribers(self, key))
 
@@ -255,20 +256,20 @@ class MemoryTransport:
     def serve(self, key_expr: str, capacity: int) -> Server:
         """Return a server that holds up to ``capacity`` waiting requests."""
         self._check_open()
-        entry = _Servant(self, key_expr, Mailbox(self._bell, capacity, keep="oldest"))
+        entry = _Queryable(self, key_expr, Mailbox(self._bell, capacity, keep="oldest"))
         self._broker.declare(entry)
         return Server(entry.inbox, self._take_request, partial(self._broker.withdraw, entry))
 
     def request(self, key: str, payload: bytes, timeout_s: float, flow: Flow) -> PendingReply:
-        """Return a request on its way to one server of ``key``."""
+        """Send a request to one server of ``key``; return its pending reply."""
         self._check_open()
         check_size(key, payload, self._max_message_bytes)
         pending = PendingReply(self._bell, timeout_s)
-        self._broker.ask(self, key, payload, pending)
+        self._broker.request(self, key, payload, pending)
         return pending
 
     def declare_alive(self, key: str) -> _MemoryToken:
-        """Return a token that others see while this transport lives."""
+        """Return a token that the others see until it or this transport is closed."""
         self._check_open()
         entry = _Token(self, key)
         self._own_tokens.add(key)
@@ -276,24 +277,24 @@ class MemoryTransport:
         return _MemoryToken(partial(self._broker.withdraw, entry))
 
     def watch_alive(self, key_expr: str) -> AliveWatch:
-        """Return a watch on tokens; it starts with those that are there."""
+        """Return a watch on tokens. Its first events are the tokens that exist already."""
         self._check_open()
         entry = _Watcher(self, key_expr, Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest"))
         self._broker.declare(entry)
         return AliveWatch(entry.inbox, self._own_tokens.__contains__, partial(self._broker.withdraw, entry))
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether anything arrived since the last call, at the latest after ``timeout_s``."""
+        """Return whether anything arrived since the last call. Wait for it at most ``timeout_s``."""
         return self._bell.wait(timeout_s)
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Return True: all is closed."""
+        """Close all declarations at once; return True."""
         self._is_closed = True
         self._broker.leave(self)
         return True
 
-    def _take_request(self, question: _Question) -> Request:
-        return Request(question.key, question.payload, partial(self._broker.answer, question))
+    def _take_request(self, query: _Query) -> Request:
+        return Request(query.key, query.payload, partial(self._broker.answer, query))
 
     def _check_open(self) -> None:
         if self._is_closed:

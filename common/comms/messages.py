@@ -1,7 +1,7 @@
-"""Every message on the wire, with the dtype, shape, unit and range of each field.
+"""All messages on the wire, with the dtype, shape, unit and range of each field.
 
-A field is added at the end, with a default: older senders are then still understood. Any other change raises
-the message's VERSION, and that of the messages it is part of. Arrays are read-only once decoded.
+A new field is added at the end, with a default: then messages of older senders stay valid. Any other change raises
+the message's VERSION, and the VERSION of the messages that contain it. Decoded arrays are read-only.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,8 @@ U64 = npt.NDArray[np.uint64]
 I32 = npt.NDArray[np.int32]
 
 Count = Annotated[int, Wire("1", low=0, high=2**62)]
-# Of an actor's incarnation. Out of reach at any rate (4 a second: 70 million years), and whole as a heartbeat's float.
+# Of an actor's incarnation. No actor reaches the limit (4 a second: 70 million years), and a heartbeat's float is
+# exact.
 Sequence = Annotated[int, Wire("1", low=0, high=2**53)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
@@ -34,25 +35,25 @@ RALLY_WIDTH = 11  # columns of a rally on the wire
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RallyBatch:
-    """Valid launches by row: position 3 (m), velocity 3 (m/s), spin 3 (rad/s), drag and lift factor."""
+    """Valid launches, one a row: position 3 (m), velocity 3 (m/s), spin 3 (rad/s), drag and lift factor."""
 
-    VERSION: ClassVar[int] = 1
+    VERSION: ClassVar[int] = 2
 
     source: str  # id of the generator
     incarnation: Count
     sequence: Count  # of this source and shard: a gap is a lost batch
     shard: Count
-    block: Count  # index of the block of candidates: the same for everyone who asks for it
+    block: Count  # index of the block of candidates: the same block for every request
     rallies: Annotated[F64, Wire("m, m/s, rad/s, 1", "<f8", f"N {RALLY_WIDTH}")]
     seeds: Annotated[U64, Wire("1", "<u8", "N")]
-    candidates: Count  # launches drawn to find these
-    preset: str
-    noise: str
+    candidates: Count  # launches that were drawn to find these
+    launch: str  # preset
+    randomization: str  # profile
 
 
 @dataclass(frozen=True, slots=True)
 class RallyRequest:
-    """Asks a generator for one block by its index; the reply is a `RallyBatch`."""
+    """A request to a generator for one block by its index. The reply is a `RallyBatch`."""
 
     VERSION: ClassVar[int] = 1
 
@@ -61,24 +62,24 @@ class RallyRequest:
 
 
 AVERAGE = b"average"
-"""Asked with this payload, the policy's queryable answers with the running mean of the weights; with none, with the
-newest weights."""
+"""Payload of a policy request for the running mean of the weights. An empty payload requests the newest weights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolicySnapshot:
-    """All that an actor needs to play one version of the policy, in one blob."""
+    """One version of the policy, with all that an actor needs to play it."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     run: str
     generation: Count
     version: Count
-    stage_number: Count  # how many stage changes went before
+    stage_number: Count  # stage changes before this version
     stage: Stage
     epoch: Count
     frames: Count
-    contract_hash: str  # of the observation, action and network layout
+    contract_hash: str  # of task and network
+    training_hash: str  # of task, network and experience
     weights: bytes  # safetensors
     obs_mean: Annotated[F64, Wire("as the observation", "<f8", "D")]
     obs_var: Annotated[F64, Wire("its square", "<f8", "D", low=0)]
@@ -87,7 +88,7 @@ class PolicySnapshot:
 
 @dataclass(frozen=True, slots=True)
 class StageChange:
-    """The curriculum went on; ``number`` counts the changes of a run, through restarts."""
+    """A change to the next curriculum stage. ``number`` counts the changes of a run, across restarts."""
 
     VERSION: ClassVar[int] = 1
 
@@ -102,14 +103,14 @@ class StageChange:
 
 @dataclass(frozen=True, slots=True)
 class StageLog:
-    """All stage changes of a run so far, oldest first: the truth behind the hints."""
+    """All stage changes of a run so far, oldest first. Hints may be lost; this reply is complete."""
 
     VERSION: ClassVar[int] = 1
 
     changes: tuple[StageChange, ...]
 
     def fault(self) -> str:
-        """Return what is inconsistent, or ""."""
+        """Return the inconsistency, or "" if there is none."""
         numbers = [change.number for change in self.changes]
         return "" if numbers == sorted(set(numbers)) else f"stage numbers {numbers}; allowed: increasing"
 
@@ -125,15 +126,17 @@ class Episodes:
     caught: Annotated[Bool, Wire("", "|b1", "E")]
     over: Annotated[Bool, Wire("", "|b1", "E")]
     landed: Annotated[Bool, Wire("", "|b1", "E")]
-    unvalidated: Annotated[Bool, Wire("", "|b1", "E")]  # launches that nobody has checked: in no rate
+    unvalidated: Annotated[
+        Bool, Wire("", "|b1", "E")
+    ]  # launches that no generator validated: they count in no rate
     returns: Annotated[F32, Wire("reward", "<f4", "E")]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rollout:
-    """One contiguous block of T control steps in B environments, as it was played."""
+    """One contiguous block of T control steps in B environments, as played."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     run: str
     generation: Count
@@ -142,25 +145,29 @@ class Rollout:
     actor: str
     incarnation: Count
     sequence: Sequence  # from 0 without a gap
-    contract_hash: str
+    training_hash: str  # of the actor's task, network and experience
     obs: Annotated[F32, Wire("as the observation", "<f4", "T B D")]  # raw: the learner normalises
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
-    log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log-density of the action under the policy that acted
+    log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log density of the action under the policy that acted
     rewards: Annotated[F32, Wire("reward", "<f4", "T B")]
     terminated: Annotated[Bool, Wire("", "|b1", "T B")]
     truncated: Annotated[Bool, Wire("", "|b1", "T B")]
-    final_obs: Annotated[F32, Wire("as the observation", "<f4", "K D")]  # the last real one of each truncated
-    final_index: Annotated[I32, Wire("t * B + b", "<i4", "K", low=0)]  # the step it followed, increasing
-    last_obs: Annotated[F32, Wire("as the observation", "<f4", "B D")]  # after step T: bootstrap at the cut
+    final_obs: Annotated[
+        F32, Wire("as the observation", "<f4", "K D")
+    ]  # last observation of each truncated episode
+    final_index: Annotated[I32, Wire("t * B + b", "<i4", "K", low=0)]  # the step that it follows, increasing
+    last_obs: Annotated[
+        F32, Wire("as the observation", "<f4", "B D")
+    ]  # after step T: bootstrap at the block's end
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
-    # By what the actions before a hit should have differed (hindsight.correction), or all of them where a teacher
-    # says what it would have done; rows of zeros: nothing is known
+    # Target change of the actions before a hit (hit_correction.correction), or difference to the teacher's actions. A
+    # row of zeros: no correction
     corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 
     def fault(self) -> str:
-        """Return what is inconsistent, or ""."""
+        """Return the inconsistency, or "" if there is none."""
         if self.rewards.size == 0:
             return f"no steps: shape {self.rewards.shape}; allowed: T and B from 1"
         if (self.terminated & self.truncated).any():
@@ -173,7 +180,7 @@ class Rollout:
 
 
 class VerdictKind(StrEnum):
-    """What became of a rollout."""
+    """The fate of a rollout."""
 
     ACCEPTED = "accepted"
     INVALID = "invalid"
@@ -182,13 +189,13 @@ class VerdictKind(StrEnum):
     WRONG_GENERATION = "wrong_generation"
     STALE_STAGE = "stale_stage"
     TOO_OLD = "too_old"
-    DUPLICATE = "duplicate"  # seen before; ``first`` holds the verdict of then
+    DUPLICATE = "duplicate"  # received before; ``first`` holds the first verdict
     BUSY = "busy"
-    UNREADABLE = "unreadable"  # so broken that nobody can say whose it was
+    UNREADABLE = "unreadable"  # damaged so much that its sender is unknown
     CREDITS = "credits"  # the answer to an ActorReport
 
 
-# Each sequence number gets exactly one of these; after any other kind the actor sends it again.
+# Each sequence number gets exactly one of these. After any other kind the actor sends the rollout again (ADR-0004).
 FINAL_VERDICTS = frozenset(
     {
         VerdictKind.ACCEPTED,
@@ -204,39 +211,39 @@ FINAL_VERDICTS = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The learner's answer to a rollout or a report, and where it stands itself."""
+    """The learner's answer to a rollout or a report, with the learner's own state."""
 
     VERSION: ClassVar[int] = 1
 
     kind: VerdictKind
-    first: VerdictKind  # the verdict of record: as ``kind``, but for duplicates
-    reason: str  # for people
+    first: VerdictKind  # the first verdict; differs from ``kind`` only for duplicates
+    reason: str  # for the log
     generation: Count
     version: Count
     stage_number: Count
     stage: Stage
-    # The pacing. An absolute limit, so that a lost or repeated answer changes nothing.
-    credit_limit: Count  # the actor may publish sequence numbers below this ...
-    credit_version: Count  # ... played by this version or a later one
+    # Flow control by an absolute limit: a lost or repeated answer changes nothing.
+    credit_limit: Count  # the actor may publish sequence numbers less than this ...
+    credit_version: Count  # ... if this version or a later one played them
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A rollout that got a final verdict other than accepted."""
+    """A rollout with a final verdict other than accepted."""
 
     VERSION: ClassVar[int] = 1
 
     sequence: Sequence
     kind: VerdictKind
-    generation: Count  # of the learner that said so
+    generation: Count  # of the learner that gave the verdict
 
 
 @dataclass(frozen=True, slots=True)
 class ActorReport:
-    """What became of an actor's rollouts as far as it knows; the reply is a `Verdict` with fresh credits.
+    """The fates of an actor's rollouts, as far as the actor knows them. The reply is a `Verdict` with new credits.
 
-    What is below ``published`` and not listed was accepted, or refused by the learner of ``generation``,
-    who knows that itself.
+    A rollout with a number less than ``published`` that is not listed was accepted, or the learner of ``generation``
+    refused it, and that learner knows it.
     """
 
     VERSION: ClassVar[int] = 1
@@ -244,18 +251,18 @@ class ActorReport:
     run: str
     actor: str
     incarnation: Count
-    version: Count  # of the policy that it holds
-    published: Sequence  # numbers used so far
+    version: Count  # of the policy that the actor holds
+    published: Sequence  # sequence numbers used so far
     in_flight: tuple[int, ...]
     dropped: tuple[int, ...]  # given up
-    generation: Count  # of the learner that the actor heard last; 0 is none
+    generation: Count  # of the learner that answered last; 0: none so far
     refused: tuple[Refusal, ...]  # by learners of other generations
-    leaving: bool  # nothing will follow
+    leaving: bool  # the actor sends nothing more
 
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A heartbeat: cumulative counters, so that a lost one costs nothing."""
+    """A heartbeat. Its counters are cumulative, so a lost heartbeat loses no information."""
 
     VERSION: ClassVar[int] = 1
 
@@ -269,17 +276,14 @@ class Status:
 
 
 class Command(StrEnum):
-    """What one can ask a running service to do."""
+    """A command to a running service."""
 
-    PAUSE = "pause"
-    RESUME = "resume"
-    DRAIN = "drain"  # finish what is under way, then stop
-    STOP = "stop"
+    DRAIN = "drain"  # finish the work in progress, then stop
 
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """A command to one service; the reply is a `ControlReply`."""
+    """A command to one service. The reply is a `ControlReply`."""
 
     VERSION: ClassVar[int] = 1
 
@@ -288,7 +292,7 @@ class Control:
 
 @dataclass(frozen=True, slots=True)
 class ControlReply:
-    """Whether a command was taken, and the state that the service is in now."""
+    """Whether the service accepted a command, and its state now."""
 
     VERSION: ClassVar[int] = 1
 
@@ -297,7 +301,7 @@ class ControlReply:
     reason: str
 
 
-# Every type that may stand alone on the wire.
+# All types that travel on their own.
 MESSAGES: tuple[type[Any], ...] = (
     RallyBatch,
     RallyRequest,

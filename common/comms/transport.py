@@ -1,14 +1,14 @@
-"""The one way services talk: puts, requests with an answer, and who is alive.
+"""Communication between services: puts, requests with a reply, and liveliness.
 
-Two implementations keep these promises, and one contract suite holds both to them: ``memory_transport.py``
-(several services in one process) and ``zenoh_transport.py`` (processes and machines).
+There are two implementations, and one contract suite tests both: ``memory_transport.py`` (several services in one
+process) and ``zenoh_transport.py`` (processes and machines). They guarantee:
 
-* Nothing here runs a caller's code on another thread. What arrives is put into a bounded `Mailbox`; the
-  thread that owns the service takes it out. A full mailbox drops and counts; it never holds up the network.
-* A put promises nothing: it may be lost, and whoever was not subscribed never sees it.
-* A request ends in exactly one outcome, and by its deadline: a `Reply`, or `NoReply` with the reason.
-* After a broken link everything declared (subscriptions, servers, tokens) is declared again by itself;
-  ``reconnect_count`` tells that something may have been missed meanwhile.
+* The transport never runs a caller's code on another thread. It puts arrivals into a bounded `Mailbox`, and the
+  thread that owns the service takes them out. A full mailbox drops and counts; it never blocks the network.
+* A put may be lost. Only current subscribers receive it.
+* A request ends in exactly one outcome, by its deadline: a `Reply`, or `NoReply` with the reason.
+* After a broken link the transport repeats all declarations (subscriptions, servers, tokens). A change of
+  ``reconnect_count`` means that messages may have been lost in between.
 """
 
 import time
@@ -19,18 +19,20 @@ from enum import Enum
 from threading import Condition
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
+from common.errors import ReportedError
+
 _Item = TypeVar("_Item")
 
-MAX_MESSAGE_BYTES = 64 * 1024 * 1024  # one message may take this much memory at the receiver
-MAX_ALIVE_EVENTS = 65536  # far above any fleet: an alive event must not be dropped
+MAX_MESSAGE_BYTES = 64 * 1024 * 1024  # memory of one message at the receiver
+MAX_ALIVE_EVENTS = 65536  # many more than any fleet has members: an alive event must not be dropped
 
 
-class TransportError(RuntimeError):
-    """The transport can't do what was asked: one line that names the endpoint or key and what to do."""
+class TransportError(ReportedError, RuntimeError):
+    """The transport can't do what was requested. The text is one line: the endpoint or key, and what to do."""
 
 
 class Flow(Enum):
-    """What a message is for; each transport maps it to priority and behaviour under congestion."""
+    """Purpose of a message. Each transport maps it to a priority and to a behaviour under congestion."""
 
     POLICY = "policy"
     STAGE = "stage"
@@ -42,7 +44,7 @@ class Flow(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One put as it arrived."""
+    """A put that arrived."""
 
     key: str
     payload: bytes
@@ -50,7 +52,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class AliveEvent:
-    """A liveliness token that came into sight or went out of it (ended, crashed, hung or cut off)."""
+    """A liveliness token that appeared, or that ended (its owner closed it, crashed, hangs or lost its link)."""
 
     key: str
     alive: bool
@@ -67,30 +69,32 @@ class NoReply(Enum):
     """Why a request ended without an answer."""
 
     TIMEOUT = "timeout"  # the server may or may not have seen the request
-    NO_SERVER = "no server"  # nobody serves the key, its mailbox is full, it refused, or the link broke
+    NO_SERVER = (
+        "no server"  # the key has no server, the server's mailbox is full, it refused, or the link broke
+    )
 
 
 Outcome = Reply | NoReply
 
 
 class Bell:
-    """Wakes the thread that owns a transport; one per transport, and the lock of all its mailboxes."""
+    """Wakes the thread that owns a transport. One per transport; it is also the lock of the transport's mailboxes."""
 
     def __init__(self) -> None:
         self.lock = Condition()
         self._rings = 0
-        self._heard = 0
+        self._handled = 0
 
     def ring(self) -> None:
-        """Wake whoever waits. The lock must be held."""
+        """Wake the waiting threads. The caller holds the lock."""
         self._rings += 1
         self.lock.notify_all()
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether it rang since the last call: what arrived between two calls is not slept over."""
+        """Return whether it rang since the last call. A ring between two calls ends the second at once."""
         with self.lock:
-            rang = self.lock.wait_for(lambda: self._rings != self._heard, timeout_s)
-            self._heard = self._rings
+            rang = self.lock.wait_for(lambda: self._rings != self._handled, timeout_s)
+            self._handled = self._rings
             return rang
 
 
@@ -98,15 +102,15 @@ class Mailbox(Generic[_Item]):
     """A bounded queue between the network's threads and the thread that owns the service.
 
     Args:
-        bell: Guards the queue and is rung at every arrival; one per transport.
-        capacity: Most items held.
-        keep: Which ones a full mailbox keeps. ``newest`` pushes the oldest out, so that a capacity of 1 means
-            that the latest wins; ``oldest`` refuses the arrival.
+        bell: Locks the queue, and rings at each arrival; one per transport.
+        capacity: Largest number of items.
+        keep: Which items a full mailbox keeps. ``newest``: it drops the oldest item, so with a capacity of 1 it holds
+            the latest. ``oldest``: it refuses the arrival.
     """
 
     def __init__(self, bell: Bell, capacity: int, keep: Literal["newest", "oldest"]) -> None:
         if capacity < 1:
-            raise TransportError(f"capacity {capacity} of a mailbox; allowed: 1 and above")
+            raise TransportError(f"capacity {capacity} of a mailbox; allowed: 1 or more")
         self._bell = bell
         self._capacity = capacity
         self._keep = keep
@@ -116,11 +120,11 @@ class Mailbox(Generic[_Item]):
 
     @property
     def dropped(self) -> int:
-        """How many items were lost because the mailbox was full."""
+        """Number of items lost because the mailbox was full."""
         return self._dropped
 
     def put(self, item: _Item) -> bool:
-        """Return whether ``item`` was taken in."""
+        """Add ``item``; return whether the mailbox accepted it."""
         with self._bell.lock:
             if self._is_closed:
                 return False
@@ -134,31 +138,31 @@ class Mailbox(Generic[_Item]):
             return True
 
     def take(self) -> _Item | None:
-        """Return the oldest item, or None."""
+        """Take out the oldest item; return None if there is none."""
         with self._bell.lock:
             return self._items.popleft() if self._items else None
 
     def take_all(self) -> list[_Item]:
-        """Return everything that is waiting, oldest first."""
+        """Take out all items; return them, oldest first."""
         with self._bell.lock:
             items = list(self._items)
             self._items.clear()
             return items
 
     def close(self) -> list[_Item]:
-        """Take nothing in from now on; return everything that was waiting, oldest first."""
+        """Refuse all later items; return the waiting ones, oldest first."""
         with self._bell.lock:
             self._is_closed = True
             return self.take_all()
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether something is waiting, as soon as it is or after ``timeout_s``."""
+        """Return whether an item is waiting. Wait for one at most ``timeout_s``."""
         with self._bell.lock:
             return self._bell.lock.wait_for(lambda: bool(self._items), timeout_s)
 
 
 class Subscription:
-    """The samples of one key expression that have arrived and not been taken."""
+    """The samples of one key expression that arrived and were not taken yet."""
 
     def __init__(
         self, inbox: Mailbox[Any], read: Callable[[Any], Sample], undeclare: Callable[[], None]
@@ -169,15 +173,15 @@ class Subscription:
 
     @property
     def dropped(self) -> int:
-        """How many samples were pushed out by newer ones before they were taken."""
+        """Number of samples that newer ones replaced before they were taken."""
         return self._inbox.dropped
 
     def poll(self) -> list[Sample]:
-        """Return what has arrived, oldest first; never waits."""
+        """Return the samples that arrived, oldest first. Never waits."""
         return [self._read(raw) for raw in self._inbox.take_all()]
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether a sample is there, at the latest after ``timeout_s``."""
+        """Return whether a sample is waiting. Wait for one at most ``timeout_s``."""
         return self._inbox.wait(timeout_s)
 
     def close(self) -> None:
@@ -186,7 +190,7 @@ class Subscription:
 
 
 class Request:
-    """A question that waits for its answer, which may be given long after it was taken from the server."""
+    """A request that waits for its answer. The answer may come long after the request was taken from the server."""
 
     __slots__ = ("_answer", "_ended", "key", "payload")
 
@@ -197,22 +201,22 @@ class Request:
         self._ended = False
 
     def reply(self, payload: bytes) -> None:
-        """Answer and end the request. An asker that has gone is no error; a second answer is."""
+        """Answer and end the request. A client that has left is no error; a second answer is one."""
         self._end(payload)
 
     def refuse(self) -> None:
-        """End the request without an answer: the asker gets NO_SERVER at once."""
+        """End the request without an answer: the client gets NO_SERVER at once."""
         self._end(None)
 
     def _end(self, payload: bytes | None) -> None:
         if self._ended:
-            raise TransportError(f"the request on {self.key} has been answered before")
+            raise TransportError(f"the request on {self.key} was answered before; allowed: one answer")
         self._ended = True
         self._answer(payload)
 
 
 class Server:
-    """The requests on one key expression that have arrived and not been taken."""
+    """The requests on one key expression that arrived and were not taken yet."""
 
     def __init__(
         self, inbox: Mailbox[Any], read: Callable[[Any], Request], undeclare: Callable[[], None]
@@ -223,25 +227,25 @@ class Server:
 
     @property
     def dropped(self) -> int:
-        """How many requests were turned away because the mailbox was full."""
+        """Number of requests refused because the mailbox was full."""
         return self._inbox.dropped
 
     def poll(self, timeout_s: float = 0.0) -> Request | None:
-        """Return the oldest request that waits, or None after ``timeout_s``."""
+        """Return the oldest waiting request, or None if none arrives in ``timeout_s``."""
         if timeout_s > 0.0:
             self._inbox.wait(timeout_s)
         raw = self._inbox.take()
         return None if raw is None else self._read(raw)
 
     def close(self) -> None:
-        """Stop serving; requests that nobody took end with NO_SERVER, those included that are arriving now."""
+        """Stop serving. Requests that were not taken end with NO_SERVER, also those that arrive during this call."""
         self._undeclare()
         for raw in self._inbox.close():
             self._read(raw).refuse()
 
 
 class PendingReply:
-    """A request on its way; ends in one outcome, by its deadline, whatever the network does."""
+    """A request in progress. It always ends in one outcome, by its deadline."""
 
     def __init__(self, bell: Bell, timeout_s: float) -> None:
         self._bell = bell
@@ -249,21 +253,21 @@ class PendingReply:
         self._outcome: Outcome | None = None
 
     def settle(self, outcome: Outcome) -> None:
-        """End the request; the first outcome stands. Called by the transport."""
+        """End the request. Only the first outcome counts. Called by the transport."""
         with self._bell.lock:
             if self._outcome is None:
                 self._outcome = outcome
                 self._bell.ring()
 
     def poll(self) -> Outcome | None:
-        """Return the outcome, or None while the request is on its way."""
+        """Return the outcome, or None while the request is in progress."""
         with self._bell.lock:
             if self._outcome is None and time.monotonic() >= self._deadline:
                 self._outcome = NoReply.TIMEOUT
             return self._outcome
 
     def wait(self) -> Outcome:
-        """Return the outcome, at the latest at the request's deadline."""
+        """Wait for the outcome, at most until the request's deadline; return it."""
         with self._bell.lock:
             left_s = max(0.0, self._deadline - time.monotonic())
             self._bell.lock.wait_for(lambda: self._outcome is not None, left_s)
@@ -273,7 +277,7 @@ class PendingReply:
 
 
 class AliveWatch:
-    """What changed about the tokens of one key expression; those of the own transport are left out."""
+    """Changes of the tokens of one key expression, without the tokens of the own transport."""
 
     def __init__(
         self, inbox: Mailbox[AliveEvent], is_own: Callable[[str], bool], undeclare: Callable[[], None]
@@ -284,7 +288,7 @@ class AliveWatch:
         self._alive: set[str] = set()
 
     def poll(self) -> list[AliveEvent]:
-        """Return the changes since the last call, in order; tokens that were there before come first."""
+        """Return the changes since the last call, in order. In the first call, existing tokens come first."""
         changes = []
         for event in self._inbox.take_all():
             if self._is_own(event.key) or (event.key in self._alive) == event.alive:
@@ -294,7 +298,7 @@ class AliveWatch:
         return changes
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether an event is there, at the latest after ``timeout_s``."""
+        """Return whether an event is waiting. Wait for one at most ``timeout_s``."""
         return self._inbox.wait(timeout_s)
 
     def close(self) -> None:
@@ -303,14 +307,14 @@ class AliveWatch:
 
 
 class AliveToken(Protocol):
-    """Says that its owner is alive until it is closed, or the owner's process or link dies."""
+    """Shows that its owner is alive, until it is closed or the owner's process or link fails."""
 
     def close(self) -> None:
-        """Take the token back."""
+        """Withdraw the token."""
 
 
 class Transport(Protocol):
-    """One service's connection. Its methods belong to one thread; they raise TransportError."""
+    """One service's connection. Only one thread calls its methods; they raise TransportError."""
 
     @property
     def connected(self) -> bool:
@@ -318,38 +322,38 @@ class Transport(Protocol):
 
     @property
     def reconnect_count(self) -> int:
-        """How often a broken link came back; at a change, ask again for what may have been missed."""
+        """How often a broken link was restored. After a change, request again what may have been lost."""
 
     def publish(self, key: str, payload: bytes, flow: Flow) -> None:
-        """Send to whoever subscribes now; never waits for a slow receiver, never tells about loss."""
+        """Send to all current subscribers. Never waits for a slow receiver, and does not report loss."""
 
     def matching(self, key: str, flow: Flow) -> bool:
-        """Return whether somebody subscribes to ``key`` now, so that a publisher can idle."""
+        """Return whether ``key`` has a subscriber now. If not, a publisher can idle."""
 
     def subscribe(self, key_expr: str, capacity: int) -> Subscription:
-        """Return a subscription that holds the newest ``capacity`` samples; 1 means that the latest wins."""
+        """Return a subscription that holds the newest ``capacity`` samples: with 1, the latest."""
 
     def serve(self, key_expr: str, capacity: int) -> Server:
-        """Return a server that holds up to ``capacity`` waiting requests and turns more away."""
+        """Return a server that holds up to ``capacity`` waiting requests and refuses more."""
 
     def request(self, key: str, payload: bytes, timeout_s: float, flow: Flow) -> PendingReply:
-        """Return a request on its way to one server of ``key``."""
+        """Send a request to one server of ``key``; return its pending reply."""
 
     def declare_alive(self, key: str) -> AliveToken:
-        """Return a token that others see until it or the transport is closed."""
+        """Return a token that the others see until it or the transport is closed."""
 
     def watch_alive(self, key_expr: str) -> AliveWatch:
-        """Return a watch on tokens; it starts with those that are there."""
+        """Return a watch on tokens. Its first events are the tokens that exist already."""
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether anything arrived since the last call, at the latest after ``timeout_s``."""
+        """Return whether anything arrived since the last call. Wait for it at most ``timeout_s``."""
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Return whether everything was closed within ``timeout_s``; never takes longer. Twice is allowed."""
+        """Close everything; return whether it took less than ``timeout_s``. Never takes longer. Twice is allowed."""
 
 
 def check_size(key: str, payload: bytes, max_message_bytes: int) -> None:
-    """Raise TransportError if the receiver would throw ``payload`` away unseen because of its size."""
+    """Raise TransportError if ``payload`` is so large that the receiver discards it without an error."""
     if len(payload) > max_message_bytes:
         raise TransportError(
             f"a message of {len(payload)} bytes on {key} is over the limit of {max_message_bytes}: "

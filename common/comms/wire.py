@@ -1,4 +1,4 @@
-"""What a message type declares about its fields, in one small object per field."""
+"""Declarations of a message type's fields: one small object per field."""
 
 import dataclasses
 import math
@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Protocol
 
 
 class Message(Protocol):
-    """A frozen dataclass with a version; it may define `fault` for what its fields can't say."""
+    """A frozen dataclass with a version. It may define `fault` to check what no single field can check."""
 
     VERSION: ClassVar[int]
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -16,15 +16,15 @@ class Message(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """What one field of a message holds.
+    """The content of one field of a message.
 
     Args:
-        unit: Unit of the number or numbers; "1" without one, "" where the question makes no sense.
+        unit: Unit of the number or numbers: "1" for a number without unit, "" for a field that is not a number.
         dtype: numpy dtype of an array, with its byte order.
-        dims: Shape of an array: names that mean the same length throughout the message, or numbers.
+        dims: Shape of an array: numbers, or names. A name has the same length throughout the message.
         low: Least value allowed.
         high: Greatest value allowed.
-        nan: Whether NaN means something here. Infinity never does.
+        nan: Whether NaN is allowed. Infinity never is.
     """
 
     unit: str = ""
@@ -37,7 +37,7 @@ class Wire:
 
 @dataclass(frozen=True, slots=True)
 class Slot:
-    """One field of a message type, as its declaration says."""
+    """One field of a message type, as declared."""
 
     name: str
     kind: Any  # the annotation without Annotated
@@ -49,7 +49,7 @@ _slots_by_type: dict[type, tuple[Slot, ...]] = {}
 
 
 def slots_of(kind: type) -> tuple[Slot, ...]:
-    """Return the fields of a message type, in their order."""
+    """Return the fields of a message type, in order of declaration."""
     if kind not in _slots_by_type:
         _slots_by_type[kind] = _declared_slots(kind)
     return _slots_by_type[kind]
@@ -68,13 +68,13 @@ def _declared_slots(kind: type) -> tuple[Slot, ...]:
 
 
 class Dims:
-    """The lengths that a message's dimension names have taken, and who set them."""
+    """The length of each dimension name of one message, and the field that set it."""
 
     def __init__(self) -> None:
         self._lengths: dict[str, tuple[int, str]] = {}
 
     def fault(self, shape: tuple[int, ...], dims: str, where: str) -> str:
-        """Return what is wrong with a shape, or ""."""
+        """Return the fault of a shape, or "" for a valid one."""
         names = dims.split()
         if len(shape) != len(names):
             return f"shape {shape}; allowed: [{', '.join(names)}]"

@@ -1,11 +1,12 @@
-"""Where the hub is, and the Zenoh settings that make the transport keep its promises.
+"""The hub's endpoint, and the Zenoh settings that the transport's guarantees need.
 
-Every value is there because its default lost or froze something in measurements:
+In measurements the default of each of these settings lost messages or blocked a process:
 
-* shared memory off: with it on, a receiver that was paused for 0.12 s read other messages' bytes, unnoticed;
-* multicast, gossip and the admin space off: only the endpoints that somebody wrote down;
-* ``wait_before_close`` finite (-1 panics) and long: a put that gives up closes the link without an error;
-* a short lease, so that a hung process is noticed; a receive buffer that doubles the throughput at 1 MB.
+* Shared memory is off. With it, a receiver that was paused for 0.12 s read the bytes of other messages, without an
+  error.
+* Multicast, gossip and the admin space are off: Zenoh uses only the configured endpoints.
+* ``wait_before_close`` is finite (-1 panics) and long: a put that times out closes the link without an error.
+* The lease is short, so that a hung process is detected. The receive buffer doubles the throughput at 1 MB.
 """
 
 from typing import Any, Literal, Self
@@ -13,53 +14,63 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
-class ZenohConfig(BaseModel):
-    """Where the hub is and how to get there."""
+class LinkConfig(BaseModel):
+    """Where the hub is and how to get there: the same for all services of a run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    mode: Literal["hub", "client"] = Field("client", description="listen at the endpoint, or connect to it")
     endpoint: str = Field(
         "tcp/127.0.0.1:7447",
         pattern=r"^(tcp|tls|unixsock-stream)/.+",
-        description="where the hub listens",
+        description="endpoint of the hub",
     )
     peers: tuple[str, ...] = Field((), description="endpoints of other routers that a hub connects to")
     connect_timeout_s: float = Field(
-        60.0, gt=0, description="how long a client waits for the hub", json_schema_extra={"unit": "s"}
+        60.0,
+        gt=0,
+        description="longest time that a client waits for the hub",
+        json_schema_extra={"unit": "s"},
     )
     lease_s: float = Field(
         3.0,
         ge=0.5,
         le=60,
-        description="silence after which others count us as gone",
+        description="silence after which the others consider this process gone",
         json_schema_extra={"unit": "s"},
     )
     max_message_mib: int = Field(
         64, ge=1, le=1024, description="largest message", json_schema_extra={"unit": "MiB"}
     )
-    tls_ca: str = Field("", description="file with the authority's certificate; given = mutual TLS")
-    tls_certificate: str = Field("", description="file with our certificate")
-    tls_key: str = Field("", description="file with our private key")
+    tls_ca: str = Field("", description="file with the authority's certificate; if given, TLS is mutual")
+    tls_certificate: str = Field("", description="file with this service's certificate")
+    tls_key: str = Field("", description="file with this service's private key")
 
     @model_validator(mode="after")
     def _tls_is_whole(self) -> Self:
         files = (self.tls_ca, self.tls_certificate, self.tls_key)
         if self.endpoint.startswith("tls/") != any(files) or any(files) != all(files):
             raise ValueError(
-                f"endpoint {self.endpoint} with tls_ca, tls_certificate, tls_key = {files}; "
-                "allowed: all three with tls/..., none without"
+                f"endpoint {self.endpoint} needs {'all' if self.endpoint.startswith('tls/') else 'none'} of tls_ca, "
+                f"tls_certificate, tls_key; got {files}; allowed: all three with tls/..., none without"
             )
         return self
 
 
+class ZenohConfig(LinkConfig):
+    """One end of a link: the hub, or a client of it."""
+
+    mode: Literal["hub", "client"] = Field(
+        "client", exclude=True, description="listen at the endpoint, or connect to it"
+    )
+
+
 def session_settings(config: ZenohConfig, attempt_s: float) -> dict[str, Any]:
-    """Return Zenoh's settings by path; ``attempt_s`` bounds one attempt to connect."""
+    """Return Zenoh's settings by path. One attempt to connect takes at most ``attempt_s`` [s]."""
     settings: dict[str, Any] = {
         "mode": "router" if config.mode == "hub" else "client",
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "scouting/delay": 10,  # ms; a hub would sit out 500 for peers that it never looks for
+        "scouting/delay": 10,  # ms; by default a hub waits 500 ms for peers, which it does not need
         "adminspace/enabled": False,
         "listen/endpoints": [config.endpoint] if config.mode == "hub" else [],
         "connect/endpoints": list(config.peers) if config.mode == "hub" else [config.endpoint],

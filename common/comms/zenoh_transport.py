@@ -1,16 +1,16 @@
-"""The transport over Zenoh: the only file that imports it.
+"""The transport over Zenoh. Only this file imports it.
 
-The star: one hub (the learner's session, or a site's router) listens, everyone else is a client of it. What
-the code below works around, all of it measured:
+The topology is a star: one hub (the learner's session, or a site's router) listens, and all others are its clients.
+The code works around these properties of Zenoh, all of them measured:
 
-* a full Zenoh channel blocks one of two receiving threads of the process, so callbacks fill `Mailbox` rings,
-  which never block, and there are 8 threads;
-* a callback on a Python thread of its own keeps the process from exiting; a direct callback has none;
-* `zenoh.open` can't be interrupted, so it gets a short time-out, in a loop;
-* a session that was inherited by a fork discards everything in silence, so the process id is checked;
-* callbacks go on for a moment after a queryable is undeclared, so a server's mailbox is closed too; a request
-  that is inside Zenoh right then is lost there (6 in 9,000 sent as their server closed) and times out;
-* `close` waits for a hung hub, so it runs on a thread that may be left behind.
+* A full Zenoh channel blocks one of the two receiving threads of the process. So callbacks fill `Mailbox` rings,
+  which never block, and there are 8 threads.
+* A callback on its own Python thread prevents the process from exiting. A direct callback has no thread.
+* `zenoh.open` can't be interrupted. So it is called in a loop, with a short time-out.
+* A session inherited by a fork discards everything without an error. So the process id is checked.
+* Callbacks continue for a moment after a queryable is undeclared. So a server's mailbox is closed too. A request
+  that is inside Zenoh at that moment is lost (6 of 9,000 sent while their server closed) and times out.
+* `close` waits for a hung hub. So it runs on a thread of its own, which may outlive the call.
 """
 
 import json
@@ -48,7 +48,7 @@ from common.comms.zenoh_config import ZenohConfig, session_settings
 
 log = logging.getLogger(__name__)
 
-# Read by Zenoh when its first session is opened, not when it is imported.
+# Zenoh reads this when it opens its first session, not when it is imported.
 os.environ.setdefault(
     "ZENOH_RUNTIME", "(rx: (worker_threads: 8), app: (worker_threads: 2), net: (worker_threads: 2))"
 )
@@ -63,7 +63,7 @@ class _Service:
     """How Zenoh treats one flow."""
 
     priority: zenoh.Priority
-    express: bool = False  # sent at once, not batched with what follows
+    express: bool = False  # sent at once, not in a batch with later messages
 
 
 _SERVICES: Final = {
@@ -77,7 +77,7 @@ _SERVICES: Final = {
 
 
 def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "ZenohTransport":
-    """Return an open transport; a client waits for its hub, at most ``connect_timeout_s`` or until ``stop``.
+    """Return an open transport. A client waits for its hub, at most ``connect_timeout_s`` or until ``stop``.
 
     Raises:
         TransportError: The hub's port is taken, or no hub answered in time.
@@ -87,8 +87,8 @@ def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "Zen
             return ZenohTransport(zenoh.open(_zenoh_config(config, _OPEN_ATTEMPT_S)), config)
         except zenoh.ZError as error:
             raise TransportError(
-                f"can't listen at {config.endpoint}: {_reason(error)}; is another learner running there? "
-                "Stop it or choose another endpoint"
+                f"can't listen at {config.endpoint}: {_reason(error)}; stop the learner that listens there, "
+                "or choose another endpoint"
             ) from error
     started = time.monotonic()
     next_log = started
@@ -96,7 +96,7 @@ def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "Zen
         now = time.monotonic()
         left = started + config.connect_timeout_s - now
         if stop is not None and stop.is_set():
-            raise TransportError(f"asked to stop while waiting for the hub at {config.endpoint}")
+            raise TransportError(f"stopped while waiting for the hub at {config.endpoint}")
         if left <= 0:
             raise TransportError(
                 f"no hub answered at {config.endpoint} in {now - started:.0f} s: "
@@ -122,7 +122,7 @@ def _zenoh_config(config: ZenohConfig, attempt_s: float) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the first line of Zenoh's message without the source position it ends in."""
+    """Return the first line of Zenoh's message without the source position at its end."""
     return str(error).splitlines()[0].split(" at /")[0]
 
 
@@ -132,7 +132,7 @@ class _ZenohToken:
 
 
 class ZenohTransport:
-    """One service's session; `Transport` says what its methods promise."""
+    """One service's session. `Transport` documents its methods."""
 
     def __init__(self, session: zenoh.Session, config: ZenohConfig) -> None:
         self._session = session
@@ -146,31 +146,31 @@ class ZenohTransport:
         self._times_up = 0
         self._link_events: Mailbox[tuple[str, bool]] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
         session.info.declare_transport_events_listener(
-            Callback(self._note_link, indirect=False), history=True
+            Callback(self._record_link_event, indirect=False), history=True
         )
 
     @property
     def connected(self) -> bool:
-        """Whether the hub is reachable now; a hub always is."""
-        self._follow_links()
+        """Whether the hub is reachable now. For a hub it always is."""
+        self._update_links()
         return not self._is_closed and (self._config.mode == "hub" or any(self._links.values()))
 
     @property
     def reconnect_count(self) -> int:
-        """How often the link to the hub came back; 0 for a hub."""
-        self._follow_links()
+        """How often the link to the hub was restored; 0 for a hub."""
+        self._update_links()
         return 0 if self._config.mode == "hub" else max(0, self._times_up - 1)
 
     def publish(self, key: str, payload: bytes, flow: Flow) -> None:
-        """Send to whoever subscribes now; never waits for a slow receiver, never tells about loss."""
+        """Send to all current subscribers. Never waits for a slow receiver, and does not report loss."""
         check_size(key, payload, self._config.max_message_mib * _MIB)
         with self._zenoh(f"publish on {key}"):
             self._publisher(key, flow).put(payload)
 
     def matching(self, key: str, flow: Flow) -> bool:
-        """Return whether somebody subscribes to ``key`` now."""
+        """Return whether ``key`` has a subscriber now."""
         with self._zenoh(f"look for subscribers of {key}"):
-            # a MatchingStatus; Zenoh's type stub says bool
+            # a MatchingStatus, though Zenoh's type stub declares bool
             status: Any = self._publisher(key, flow).matching_status
             return bool(status.matching)
 
@@ -185,18 +185,18 @@ class ZenohTransport:
         """Return a server that holds up to ``capacity`` waiting requests."""
         inbox: Mailbox[zenoh.Query] = Mailbox(self._bell, capacity, keep="oldest")
 
-        def take_in(query: zenoh.Query) -> None:
+        def receive(query: zenoh.Query) -> None:
             if not inbox.put(query):
                 _answer(query, None)
 
         with self._zenoh(f"serve {key_expr}"):
-            queryable = self._session.declare_queryable(key_expr, Callback(take_in, indirect=False))
+            queryable = self._session.declare_queryable(key_expr, Callback(receive, indirect=False))
         return Server(inbox, _read_query, partial(self._undeclare, queryable))
 
     def request(self, key: str, payload: bytes, timeout_s: float, flow: Flow) -> PendingReply:
-        """Return a request on its way to one server of ``key``.
+        """Send a request to one server of ``key``; return its pending reply.
 
-        A hub that hangs can hold up the caller of a large request: at most 15 s, then the link is closed.
+        A hung hub can block the caller of a large request for at most 15 s. Then the link is closed.
         """
         check_size(key, payload, self._config.max_message_mib * _MIB)
         pending = PendingReply(self._bell, timeout_s)
@@ -210,7 +210,7 @@ class ZenohTransport:
                 target=zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
-                # BLOCK: one asker, one server, an answer each; the reply inherits it
+                # BLOCK: one client, one server, one reply each; the reply inherits it
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 priority=service.priority,
                 express=service.express,
@@ -219,31 +219,31 @@ class ZenohTransport:
         return pending
 
     def declare_alive(self, key: str) -> _ZenohToken:
-        """Return a token that others see while this transport lives."""
+        """Return a token that the others see until it or this transport is closed."""
         with self._zenoh(f"declare {key}"):
             token = self._session.liveliness().declare_token(key)
-        self._own_tokens[key] = token  # a token that nobody holds is undeclared
+        self._own_tokens[key] = token  # Zenoh undeclares a token without a reference
         return _ZenohToken(partial(self._undeclare, token))
 
     def watch_alive(self, key_expr: str) -> AliveWatch:
-        """Return a watch on tokens; it starts with those that are there."""
+        """Return a watch on tokens. Its first events are the tokens that exist already."""
         inbox: Mailbox[AliveEvent] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
 
-        def take_in(sample: zenoh.Sample) -> None:
+        def receive(sample: zenoh.Sample) -> None:
             inbox.put(AliveEvent(key=str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT))
 
         with self._zenoh(f"watch {key_expr}"):
             watcher = self._session.liveliness().declare_subscriber(
-                key_expr, Callback(take_in, indirect=False), history=True
+                key_expr, Callback(receive, indirect=False), history=True
             )
         return AliveWatch(inbox, self._own_tokens.__contains__, partial(self._undeclare, watcher))
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether anything arrived since the last call, at the latest after ``timeout_s``."""
+        """Return whether anything arrived since the last call. Wait for it at most ``timeout_s``."""
         return self._bell.wait(timeout_s)
 
     def close(self, timeout_s: float = 5.0) -> bool:
-        """Return whether the session was closed within ``timeout_s``; what has been sent is flushed first."""
+        """Flush and close the session; return whether it took less than ``timeout_s``."""
         if self._is_closed or os.getpid() != self._process:
             return True
         self._is_closed = True
@@ -251,7 +251,7 @@ class ZenohTransport:
         closer.start()
         closer.join(timeout_s)
         if closer.is_alive():
-            log.warning("gave up closing endpoint=%s after_s=%.1f", self._config.endpoint, timeout_s)
+            log.warning("close timed out endpoint=%s after_s=%.1f", self._config.endpoint, timeout_s)
         return not closer.is_alive()
 
     def _publisher(self, key: str, flow: Flow) -> zenoh.Publisher:
@@ -259,7 +259,7 @@ class ZenohTransport:
             service = _SERVICES[flow]
             self._publishers[key, flow] = self._session.declare_publisher(
                 key,
-                # with BLOCK, one hung subscriber would hold up the publisher and with it all others
+                # with BLOCK, one hung subscriber blocks the publisher and so all other subscribers
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=service.priority,
                 express=service.express,
@@ -273,7 +273,7 @@ class ZenohTransport:
 
     @contextmanager
     def _zenoh(self, action: str) -> Iterator[None]:
-        """Turn what Zenoh raises into one line, and refuse to work where it would fail in silence."""
+        """Turn Zenoh's errors into one line, and raise where Zenoh fails without an error."""
         if self._is_closed:
             raise TransportError(f"can't {action}: this transport is closed")
         if os.getpid() != self._process:
@@ -286,10 +286,10 @@ class ZenohTransport:
         except zenoh.ZError as error:
             raise TransportError(f"can't {action} at {self._config.endpoint}: {_reason(error)}") from error
 
-    def _note_link(self, event: zenoh.TransportEvent) -> None:
+    def _record_link_event(self, event: zenoh.TransportEvent) -> None:
         self._link_events.put((str(event.transport.zid), event.kind == zenoh.SampleKind.PUT))
 
-    def _follow_links(self) -> None:
+    def _update_links(self) -> None:
         for peer, up in self._link_events.take_all():
             self._times_up += up
             self._links[peer] = up
@@ -309,11 +309,11 @@ def _answer(query: zenoh.Query, payload: bytes | None) -> None:
         if payload is not None:
             query.reply(query.key_expr, payload)
     except zenoh.ZError as error:
-        log.debug("the asker has gone key=%s reason=%s", query.key_expr, _reason(error))
+        log.debug("reply not sent, the client has left key=%s reason=%s", query.key_expr, _reason(error))
     finally:
-        query.drop()  # type: ignore[no-untyped-call]  # ends it, else the asker waits for its time-out
+        query.drop()  # type: ignore[no-untyped-call]  # ends the query; without it the client waits for its time-out
 
 
 def _settle(pending: PendingReply, reply: zenoh.Reply) -> None:
-    # The only error replies are Zenoh's own: its time-out.
+    # All error replies are Zenoh's own: its time-out.
     pending.settle(NoReply.TIMEOUT if reply.ok is None else Reply(reply.ok.payload.to_bytes()))

@@ -1,28 +1,26 @@
-"""Valid rallies drawn where they are played: for Gymnasium, benchmarks and tests, with no generator about."""
+"""Valid rallies drawn in the process that plays them: for Gymnasium, benchmarks and tests."""
+
+from typing import Final
 
 import numpy as np
 
 from common.env.rally_env import Launches
-from common.physics.flight import SIMPLE
-from common.rally.launch import LAUNCH_SIZE, RallyBlock, draw_rallies
+from common.task.config import TaskConfig
+from common.task.launch import LAUNCH_SIZE, RallyBlock, draw_rallies
 
-BLOCK = 256  # rallies drawn at once: some 2 ms
+BLOCK: Final = 256  # rallies drawn at once: about 2 ms
 
 
 class LocalRallies:
-    """An endless source of valid rallies: a function of its arguments, in every process the same.
+    """An endless source of valid rallies. The same arguments give the same rallies in every process.
 
     Args:
         seed: 0 .. 2^64 - 1.
-        preset: A key of ``launch_presets.PRESETS``.
-        noise: A key of ``noise.PROFILES``.
-        model: ``flight.SIMPLE`` or ``flight.FULL``, as the environment flies them.
+        task: Its launch preset, randomization and flight are used.
     """
 
-    def __init__(
-        self, seed: int, preset: str = "paper", noise: str = "standard", model: int = SIMPLE
-    ) -> None:
-        self._seed, self._preset, self._noise, self._model = seed, preset, noise, model
+    def __init__(self, seed: int, task: TaskConfig = TaskConfig()) -> None:
+        self._seed, self._task = seed, task
         self._next_block = 0
         self._block = RallyBlock(np.empty((0, LAUNCH_SIZE)), np.empty(0, np.uint64), 0)
         self._used = 0
@@ -36,15 +34,8 @@ class LocalRallies:
         return Launches(self._block.launches[rows], self._block.seeds[rows], np.ones(count, np.bool_))
 
     def _draw(self) -> None:
-        """Put another block behind what is left."""
-        drawn = draw_rallies(
-            BLOCK,
-            seed=self._seed,
-            block=self._next_block,
-            preset=self._preset,
-            noise=self._noise,
-            model=self._model,
-        )
+        """Append another block to the rallies that are left."""
+        drawn = draw_rallies(BLOCK, self._task, seed=self._seed, block=self._next_block)
         self._next_block += 1
         self._block = RallyBlock(
             np.concatenate([self._block.launches[self._used :], drawn.launches]),

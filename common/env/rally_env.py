@@ -1,26 +1,28 @@
 """The vectorised rally environment: one call plays B robots and B balls for one control step."""
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 
-from common.env.collision import Collision, TailoredCollision
-from common.env.original_collision import OriginalCollision, RobotAndBall
-from common.env.review import NO_LESSONS, Lessons, Review
-from common.env.robot import RobotBatch, RobotPreset
+from common.env.contacts import Contacts, TailoredContacts
+from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections, HitCorrector
+from common.env.mujoco_ball import RobotAndBall
+from common.env.mujoco_contacts import MujocoContacts
+from common.env.robot import RobotBatch
 from common.jit import kernel
-from common.physics.constants import GRID_STEP
-from common.physics.flight import FULL, SIMPLE
-from common.rally import play
-from common.rally.draws import Stream, between, uniform
-from common.rally.noise import PROFILES, Condition, NoiseProfile
-from common.rally.observation import ACTION_SIZE, ObservationConfig, critic_layout, policy_layout, size
-from common.rally.prediction import new_tracks
-from common.rally.reward import RewardConfig, reward_table
-from common.rally.trajectory import Outcome, transition_table
+from common.perception.flight_track import new_tracks
+from common.rally.observe import observation_flags, observe
+from common.rally.state import NO_SAMPLE, RING, Rallies, Rules, allocate
+from common.rally.step import launch_rallies
+from common.task.config import TaskConfig
+from common.task.counter_rng import Stream, between, uniform
+from common.task.experience import ExperienceConfig
+from common.task.observation import ACTION_SIZE, ObservationConfig, critic_layout, policy_layout, size
+from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
+from common.task.reward import reward_table
+from common.task.states import Outcome, transition_table
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -30,120 +32,22 @@ Rows = npt.NDArray[np.int64]
 _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
 
 
-class TeacherConfig(BaseModel):
-    """A policy that a new one learns from first, for as long as it says what it would have done itself.
-
-    It may see more than its pupil: DAgger (Ross, Gordon, Bagnell 2011), with a teacher who looks at other numbers.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    policy: str = Field(
-        "", description="policy folder, the same path for learner and actors; empty: no teacher"
-    )
-    epochs: int = Field(
-        600,
-        ge=1,
-        description="first epochs of a run, in which the policy learns what the teacher would have done in its place; "
-        "then from rewards, as without one",
-        json_schema_extra={"unit": "datasets"},
-    )
-    towards_middle: float = Field(
-        0.0,
-        ge=0,
-        lt=1,
-        description="share of the way to the court's middle by which the targets shown to the teacher are moved: a "
-        "pupil that sees less misses by more, and should aim farther inside",
-    )
-    notes: bool = Field(
-        False,
-        description="have a pupil without memory take notes: until the stroke, wrist and roll hold where the ball was "
-        "and how it flew as it was first seen, by which it shows how it spins (teacher.py)",
-    )
-    through_arm: bool = Field(
-        False,
-        description="learn as well what to do now for the arm to tell later: a memory for a policy that has no other "
-        "(gradients through kinematics and drives)",
-    )
-    log_sigma: float = Field(
-        1.0,
-        ge=-10,
-        le=1,
-        description="log of the action noise is at most this while it teaches: noise wipes out what an arm remembers",
-    )
-
-    def teaches(self, version: int) -> bool:
-        """Return whether the policy of this version, one an epoch, is still being taught."""
-        return bool(self.policy) and version < self.epochs
-
-
-class EnvConfig(BaseModel):
-    """The task: robot, rates, noise and reward."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    robot: RobotPreset = Field("rails", description="robot: ours, or the same slowed to the authors' limits")
-    control_rate_hz: Literal[25, 50, 100, 200] = Field(
-        50, description="control steps a second", json_schema_extra={"unit": "Hz"}
-    )
-    noise: Literal["off", "standard", "hard"] = Field(
-        "standard", description="what differs from rally to rally"
-    )
-    perception: Literal["cheap", "full"] = Field(
-        "cheap",
-        description="what is seen of the ball: its true state, late and noisy, or an estimate from a simulated camera",
-    )
-    flight: Literal["simple", "full"] = Field("simple", description="aerodynamics of the ball")
-    collision: Literal["tailored", "original"] = Field(
-        "tailored",
-        description="whose bounces: ours, exact and measured, or MuJoCo's own, half as fast",
-    )
-    time_limit_s: float = Field(
-        2.5, gt=0.1, le=60, description="longest rally; cut, not lost", json_schema_extra={"unit": "s"}
-    )
-    carry_over: float = Field(
-        0.5, ge=0, le=1, description="share of episodes that begin as the last stroke left the robot"
-    )
-    go_on: float = Field(
-        0.1, ge=0, le=1, description="share of episodes that go on over a return into a next rally"
-    )
-    foresee: float = Field(
-        0.8,
-        ge=0,
-        le=1,
-        description="share of episodes that end once the ball is hit: its flight home is computed and paid at once",
-    )
-    hindsight: bool = Field(
-        True, description="in stage 3, tell the learner what the last actions before a hit should have been"
-    )
-    teacher: TeacherConfig = TeacherConfig()
-    rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
-    reset_spread: float = Field(
-        0.1,
-        ge=0,
-        le=0.5,
-        description="joints start at home plus up to this",
-        json_schema_extra={"unit": "m, rad"},
-    )
-    reward: RewardConfig = RewardConfig()
-    observation: ObservationConfig = ObservationConfig()
-
-
 class RallySource(Protocol):
     """Where the environment gets its rallies."""
 
     def take(self, count: int) -> "Launches":
-        """Return ``count`` launches; never blocks."""
+        """Return ``count`` launches. Never blocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Launches:
     """Rallies to play, as generated."""
 
-    records: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
+    launches: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
     seeds: npt.NDArray[np.uint64]  # (n,)
-    validated: Flags  # (n,) False: a random launch that no generator flew; left out of all rates
-    paths: Array | None = None  # (n, path_rows, 7) as play.keep_to_path, where the environment drives balls
+    validated: Flags  # (n,) False: a launch that was not validated; all rates leave it out
+    # (n, path_rows, 7) recorded tracks that drive the balls (``step.snap_to_recorded_track``); None: physics alone
+    paths: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +56,7 @@ class FinishedRallies:
 
     rows: Rows  # (n,) which environment
     seeds: npt.NDArray[np.uint64]  # (n,)
-    outcomes: npt.NDArray[np.uint8]  # (n,) trajectory.Outcome
+    outcomes: npt.NDArray[np.uint8]  # (n,) states.Outcome
     landings: Floats  # (n, 2) [m] where on the opponent's court; nan where nothing landed
     landing_errors: Floats  # (n,) [m] their distance to the target
     caught: Flags  # (n,)
@@ -160,29 +64,29 @@ class FinishedRallies:
     validated: Flags  # (n,)
     returns: Floats  # (n,) undiscounted reward of the rally
     lengths: npt.NDArray[np.int32]  # (n,) control steps
-    conditions: Array  # (n, 14) noise.Condition
+    parameters: Array  # (n, 14) randomization.RallyParameter
     rounds: npt.NDArray[np.int32]  # (n,) which rally of its episode: 1 for the first
 
 
 @dataclass(frozen=True, slots=True)
 class EnvStep:
-    """What one control step brought. Environments that ended are reset already."""
+    """The result of one control step. Environments that ended are already reset."""
 
     obs: Floats  # (B, D) observation.critic_layout of the next step: after a reset the new episode's first
     reward: Floats  # (B,)
     terminated: Flags  # (B,) the rally ended by its rules: the value of what follows is 0
-    truncated: Flags  # (B,) the time limit cut it: bootstrap from final_obs
+    truncated: Flags  # (B,) the time limit cut the rally: bootstrap from final_obs
     ended: Rows  # (n,) rows with terminated or truncated
     final_obs: Floats  # (n, D) the last observation of each of ``ended``
     terms: Array  # (B, 8) reward.TERMS
     finished: FinishedRallies
-    lessons: Lessons  # what hits of this step say about the last actions
+    hit_corrections: HitCorrections  # of the hits in this step
 
 
 @kernel
 def _draw_robot(
     seeds: npt.NDArray[np.uint64],
-    noise: NoiseProfile,
+    profile: RandomizationProfile,
     carry_over: float,
     spread: float,
     gains: Array,
@@ -191,65 +95,71 @@ def _draw_robot(
     """Draw drives (n, 3, 7) and start poses (n, 7) from the rallies' seeds.
 
     Returns:
-        Which robots stay as they are (n,); numbers in [0, 1) that decide on going on over a return (n,) and on
-        ending with the hit (n,).
+        Which robots start where they are (n,), and two uniform numbers in [0, 1). They decide whether an episode
+        continues after a return (n,) and whether it ends at the hit (n,).
     """
     count = seeds.shape[0]
-    stay, go_on, ends = np.empty(count, np.bool_), np.empty(count), np.empty(count)
-    low, high = noise.gain_factor
+    stays, continues, ends = np.empty(count, np.bool_), np.empty(count), np.empty(count)
+    low, high = profile.gain_factor
     for k in range(seeds.shape[0]):
-        stay[k] = uniform(seeds[k], _RESET, 0) < carry_over
-        go_on[k] = uniform(seeds[k], _RESET, 1)
+        stays[k] = uniform(seeds[k], _RESET, 0) < carry_over
+        continues[k] = uniform(seeds[k], _RESET, 1)
         ends[k] = uniform(seeds[k], _RESET, 2 + offset.shape[1])
         for j in range(7):
             offset[k, j] = between(-spread, spread, seeds[k], _RESET, 2 + j)
             for g in range(3):
                 gains[k, g, j] = between(low, high, seeds[k], _GAINS, 7 * g + j)
-    return stay, go_on, ends
+    return stays, continues, ends
 
 
 class RallyEnv:
-    """B robots, each catching rallies from a source.
+    """B robots, each playing rallies from a source.
 
     Args:
         count: B.
-        config: The task.
+        task: The task.
         source: Where rallies come from.
-        stage: Curriculum stage 1..3, the reward's column.
+        stage: Curriculum stage 1..3: the column of the reward table.
+        experience: When episodes end or continue, and whether hits are corrected; ``experience.MATCH`` for a match.
         threads: MuJoCo threads.
-        path_rows: Samples of a path that balls keep to until they are hit; 0: they fly as physics has it.
-        onlooker: What somebody besides is told of the same rallies (``look_on``), of no more history than the policy.
+        path_rows: Samples of a recorded track that drives a ball until it is hit. 0: physics alone moves the balls.
+        extra_observation: Options of a second observation of the same rallies (``observe_extra``), such as a teacher's.
+            Its history is not longer than the task's.
     """
 
     def __init__(
         self,
         count: int,
-        config: EnvConfig,
+        task: TaskConfig,
         source: RallySource,
         stage: int = 1,
+        *,
+        experience: ExperienceConfig = ExperienceConfig(),
         threads: int = 1,
         path_rows: int = 0,
-        onlooker: ObservationConfig | None = None,
+        extra_observation: ObservationConfig | None = None,
     ) -> None:
-        if path_rows and config.collision == "original":
-            raise ValueError("a path under collision 'original': allowed is 'tailored', or no path")
+        if path_rows and task.collision == "original":
+            raise ValueError("recorded tracks under collision 'original'; allowed: collision 'tailored'")
         self.count = count
-        self.config = config
-        self._flight_model = SIMPLE if config.flight == "simple" else FULL
-        self._collision = self._make_collision(threads)
-        self.robot = self._collision.robot
-        self.noise = PROFILES[config.noise]
+        self.task = task
+        self.experience = experience
+        self._contacts = self._make_contacts(threads)
+        self.robot = self._contacts.robot
+        self._profile = PROFILES[task.randomization]
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
-        self._review = self._make_review()
-        self._told = play.told_by(config.observation)
-        self._onlooker = onlooker
-        self._rallies, self._step = play.allocate(
+        self._hit_corrector = (
+            HitCorrector(self.robot, task.flight_model) if experience.hit_correction else None
+        )
+        self._flags = observation_flags(task.observation)
+        self._extra_observation = extra_observation
+        self._rallies, self._step = allocate(
             count,
-            config.observation.history,
-            full=config.perception == "full",
+            task.observation.history,
+            has_camera=task.perception == "full",
             tracks=self._new_tracks(),
-            reviewed=self._review is not None,
+            keeps_hits=experience.hit_correction,
             path_rows=path_rows,
         )
         self._validated = np.zeros(count, np.bool_)
@@ -257,47 +167,47 @@ class RallyEnv:
         self._lengths = np.zeros(count, np.int32)
         self._rounds = np.zeros(count, np.int32)
         self._all = np.arange(count)
-        self._obs = np.zeros((count, size(critic_layout(config.observation))), np.float32)
-        self._rewards = reward_table(config.reward)
+        self._obs = np.zeros((count, size(critic_layout(task.observation))), np.float32)
+        self._rewards = reward_table()
         self._started = False
         self.set_stage(stage)
 
     def set_stage(self, stage: int) -> None:
-        """Pay by another column of R from the next step on."""
+        """Use the reward of another stage from the next step on."""
         if stage not in (1, 2, 3):
             raise ValueError(f"stage {stage!r}: allowed are 1, 2, 3")
-        config = self.config
+        task, reward = self.task, self.task.reward
         self.stage = stage
-        self._rules = play.Rules(
+        self._rules = Rules(
             transitions=transition_table(),
             rewards=np.ascontiguousarray(self._rewards[stage - 1]),
-            landing_scale=config.reward.landing_scale,
-            heading=config.reward.heading if stage == 3 else 0.0,
-            heading_scale=config.reward.heading_scale,
-            rate_scale=config.reward.reference_rate_hz / config.control_rate_hz,
-            torque_weight=config.reward.torque,
+            landing_scale=reward.landing_scale,
+            landing_bonus=reward.landing_bonus if stage == 3 else 0.0,
+            landing_bonus_scale=reward.landing_bonus_scale,
+            rate_scale=reward.reference_rate_hz / task.control_rate_hz,
+            torque_weight=reward.torque,
             torque_limit=self.robot.torque_limit,
-            jitter_weight=config.reward.jitter,
-            collision_weight=config.reward.collision,
-            grid_steps=round(1.0 / (config.control_rate_hz * GRID_STEP)),
-            time_limit=config.time_limit_s,
-            flight_model=self._flight_model,
+            jitter_weight=reward.jitter,
+            collision_weight=reward.collision,
+            grid_steps=task.grid_steps,
+            time_limit=task.time_limit_s,
+            flight_model=int(task.flight_model),
         )
 
     @property
     def validated(self) -> Flags:
-        """Which environments play a rally that a generator validated (B,)."""
+        """Which environments play a validated rally (B,)."""
         return self._validated.copy()
 
     @property
-    def rallies(self) -> play.Rallies:
-        """The rallies in play, for rendering and tests: read, don't write."""
+    def rallies(self) -> Rallies:
+        """The rallies in play, for rendering and tests. Read only."""
         return self._rallies
 
     def reset(self) -> Floats:
-        """Start every environment anew, robots at home, against strangers; return the first observations (B, D)."""
+        """Start every environment again, robots at home and opponents unknown, and return the observations (B, D)."""
         self._started = False
-        self._rallies.track[:] = self._new_tracks()  # nothing is known of the other side
+        self._rallies.track[:] = self._new_tracks()
         self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
         self._rallies.last_action[:] = self.robot.home_action
         self._begin(self._all, np.zeros(self.count, np.bool_))
@@ -306,7 +216,7 @@ class RallyEnv:
         return self._obs.copy()
 
     def step(self, actions: npt.ArrayLike) -> EnvStep:
-        """Play one control step with ``actions`` (B, 7); values beyond [-1, 1] are clipped."""
+        """Play one control step with ``actions`` (B, 7). Values beyond [-1, 1] are clipped."""
         if not self._started:
             raise RuntimeError("step() before reset(): call reset() first")
         clipped: Array = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
@@ -316,8 +226,8 @@ class RallyEnv:
             raise ValueError(
                 f"actions of rows {np.flatnonzero(~np.isfinite(clipped).all(axis=1))} aren't finite"
             )
-        self._collision.step(self._rallies, clipped, self._rules, self.noise, self._step)
-        # The rally goes on with the robot at home, but says nothing about the policy.
+        self._contacts.step(self._rallies, clipped, self._rules, self._profile, self._step)
+        # The rally continues with the robot at home, but its result says nothing about the policy.
         self._validated[self.robot.faulty] = False
         self._returns += self._step.reward
         self._lengths += 1
@@ -325,19 +235,21 @@ class RallyEnv:
 
         outcome = self._step.outcome
         over = np.flatnonzero(outcome)
-        goes_on = (outcome[over] == Outcome.RETURNED) & (self._rallies.rounds_left[over] > 1)
-        ended = over[~goes_on]
+        continues = (outcome[over] == Outcome.RETURNED) & (self._rallies.rounds_left[over] > 1)
+        ended = over[~continues]
         truncated = outcome == Outcome.TIME_OUT
         terminated = np.zeros(self.count, np.bool_)
         terminated[ended] = True
         terminated &= ~truncated
         final_obs = self._obs[ended]
-        lessons = NO_LESSONS
-        if self._review is not None:
-            lessons = self._review.look(self._rallies, self._collision.motion, self.stage == 3)
+        hit_corrections = NO_HIT_CORRECTIONS
+        if self._hit_corrector is not None:
+            hit_corrections = self._hit_corrector.update(
+                self._rallies, self._contacts.motion, self.stage == 3
+            )
         finished = self._finish(over)
         if over.size:
-            self._begin(over, goes_on)
+            self._begin(over, continues)
             self._observe(over)
         return EnvStep(
             obs=self._obs.copy(),
@@ -348,38 +260,39 @@ class RallyEnv:
             final_obs=final_obs,
             terms=self._step.terms.copy(),
             finished=finished,
-            lessons=lessons,
+            hit_corrections=hit_corrections,
         )
 
-    def look_on(self) -> Floats:
-        """Return what the onlooker sees now (B, D): ``observation.policy_layout`` of its options."""
-        if self._onlooker is None:
-            raise RuntimeError("look_on() without an onlooker: give one to the constructor")
-        seen = np.empty((self.count, size(policy_layout(self._onlooker))), np.float32)
-        told = play.told_by(self._onlooker)._replace(is_privileged=False)
-        play.observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, told, seen)
-        return seen
+    def observe_extra(self) -> Floats:
+        """Return the second observation (B, D): ``observation.policy_layout`` of its options."""
+        if self._extra_observation is None:
+            raise RuntimeError(
+                "observe_extra() without extra_observation: give its options to the constructor"
+            )
+        extra = np.empty((self.count, size(policy_layout(self._extra_observation))), np.float32)
+        flags = observation_flags(self._extra_observation)._replace(is_privileged=False)
+        observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, flags, extra)
+        return extra
 
-    def _make_collision(self, threads: int) -> Collision:
-        preset, rate = self.config.robot, self.config.control_rate_hz
-        if self.config.collision == "original":
-            return OriginalCollision(RobotAndBall(self.count, preset, rate, self._flight_model, threads))
-        return TailoredCollision(RobotBatch(self.count, preset, rate, threads=threads))
+    def _make_contacts(self, threads: int) -> Contacts:
+        task = self.task
+        if task.collision == "original":
+            robot = RobotAndBall(
+                self.count, task.robot, task.control_rate_hz, int(task.flight_model), threads
+            )
+            return MujocoContacts(robot)
+        return TailoredContacts(RobotBatch(self.count, task.robot, task.control_rate_hz, threads=threads))
 
     def _new_tracks(self) -> Array:
-        """Return a row for each ball, or none where nobody asks what its samples tell."""
-        options = self.config.observation
-        is_tracked = options.is_tracked or (self._onlooker is not None and self._onlooker.is_tracked)
-        return new_tracks(self.count if is_tracked else 0, options.spin_expected)
-
-    def _make_review(self) -> Review | None:
-        """Return who corrects hits, if anybody does."""
-        return Review(self.robot, self._flight_model) if self.config.hindsight else None
+        """Return a track for each ball, or none where no observation needs the flight filter."""
+        options, extra = self.task.observation, self._extra_observation
+        is_tracked = options.is_tracked or (extra is not None and extra.is_tracked)
+        return new_tracks(self.count if is_tracked else 0, options.expected_spin)
 
     def _observe(self, rows: Rows) -> None:
         """Write the observations of ``rows``."""
         robot = self.robot
-        play.observe(self._rallies, rows, robot.joint_pos, robot.joint_vel, self._told, self._obs)
+        observe(self._rallies, rows, robot.joint_pos, robot.joint_vel, self._flags, self._obs)
 
     def _finish(self, rows: Rows) -> FinishedRallies:
         r = self._rallies
@@ -394,33 +307,33 @@ class RallyEnv:
             validated=self._validated[rows],
             returns=self._returns[rows].astype(np.float32),
             lengths=self._lengths[rows],
-            conditions=r.condition[rows],
+            parameters=r.parameters[rows],
             rounds=self._rounds[rows],
         )
 
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
-        """Launch the next rallies on ``rows``; where ``same_episode`` the robot goes on as it stands."""
-        launches = self._source.take(rows.size)
-        path = self._rallies.camera[:, play.RING :]
-        path[rows] = play.NO_SAMPLE if launches.paths is None else launches.paths
-        play.launch_rallies(self._rallies, rows, launches.records, launches.seeds, self.noise)
-        self._validated[rows] = launches.validated
+        """Launch the next rallies on ``rows``. Where ``same_episode`` the robot starts where it is."""
+        new = self._source.take(rows.size)
+        path = self._rallies.true_sample_ring[:, RING:]
+        path[rows] = NO_SAMPLE if new.paths is None else new.paths
+        launch_rallies(self._rallies, rows, new.launches, new.seeds, self._profile)
+        self._validated[rows] = new.validated
         self._returns[rows] = 0.0
         self._lengths[rows] = 0
         self._rounds[rows] = np.where(same_episode, self._rounds[rows] + 1, 1)
         gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
-        config = self.config
-        stay, go_on, ends = _draw_robot(
-            launches.seeds, self.noise, config.carry_over, config.reset_spread, gains, offset
+        task, experience = self.task, self.experience
+        stays, continues, ends = _draw_robot(
+            new.seeds, self._profile, task.carry_over, task.reset_spread, gains, offset
         )
-        self.robot.set_gains(rows, gains, self._rallies.condition[rows, Condition.ACTION_LATENCY])
-        leaves = ~(stay & self._started) & ~same_episode
+        self.robot.set_gains(rows, gains, self._rallies.parameters[rows, RallyParameter.ACTION_LATENCY])
+        leaves = ~(stays & self._started) & ~same_episode
         home = rows[leaves]
         if home.size:
             self.robot.go_home(home, offset[leaves])
             self._rallies.last_action[home] = self.robot.home_action
-        rounds = np.where(config.rounds > 1, config.rounds, 1 + (go_on < config.go_on))
+        rounds = np.where(task.rounds > 1, task.rounds, 1 + (continues < experience.continue_share))
         left = np.where(same_episode, self._rallies.rounds_left[rows] - 1, rounds)
         self._rallies.rounds_left[rows] = left
-        self._rallies.foreseen[rows] = (left == 1) & (ends < config.foresee)
-        self._collision.launch(self._rallies, rows)
+        self._rallies.ends_at_hit[rows] = (left == 1) & (ends < experience.end_at_hit_share)
+        self._contacts.launch(self._rallies, rows)

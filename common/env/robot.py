@@ -1,41 +1,40 @@
-"""B MuJoCo robots stepped together: targets in, joint records out, one Python call a control step."""
+"""B MuJoCo robots stepped together: joint targets in, joint motion out, one Python call a control step."""
 
 import logging
 import math
 from pathlib import Path
-from typing import Literal
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
 
-from common.rally.play import Motion
+from common.rally.state import RobotMotion
+from common.task.config import RobotName
 
 log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
-RobotPreset = Literal["rails", "usst"]
 
 MODEL_PATH = Path(__file__).with_name("robot.xml")
-MUJOCO_STEP = 0.004  # [s] racket pose against 0.25 ms: tests/unit/env/test_robot.py states the error
-MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: 200 Hz, 100 Hz
+# [s] tests/unit/env/test_robot.py states the racket's error against steps of 0.25 ms (ADR-0005)
+MUJOCO_STEP = 0.004
+MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: at 100 Hz and 200 Hz
 JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
 RACKET_BODY = "racket"
-_UNDER_WAY = 1.0  # [s] MuJoCo's time as a control step begins: a simulation that was reset shows
-MAX_ACTION_LATENCY = 0.020  # [s] how far back targets are kept: the latest of any noise profile
+_START_TIME = 1.0  # [s] MuJoCo's time at the start of each control step; a reset simulation starts at 0 again
+MAX_ACTION_LATENCY = 0.020  # [s] targets are kept so long: the longest action latency of all profiles
 
-# Published limits of the group's robot: rails [m/s], yaw and pitch, the last three joints [rad/s]
+# Published speed limits of the authors' robot: rails [m/s]; yaw and pitch, then the last three joints [rad/s]
 USST_SPEED_LIMITS = (2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86)
 
 
-def load_model(preset: RobotPreset = "rails", step: float = MUJOCO_STEP) -> mujoco.MjModel:
+def load_model(preset: RobotName = "rails", step: float = MUJOCO_STEP) -> mujoco.MjModel:
     """Return the compiled robot.
 
     Args:
-        preset: ``rails`` (our robot) or ``usst`` (the same, slowed to the authors' published joint speeds:
-            damping is the speed limit, since MuJoCo has none).
+        preset: ``rails`` (our robot) or ``usst`` (the same with the published joint speeds of the authors' robot).
         step: MuJoCo's time step [s].
     """
     model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
@@ -44,8 +43,11 @@ def load_model(preset: RobotPreset = "rails", step: float = MUJOCO_STEP) -> mujo
     return model
 
 
-def limit_speeds(model: mujoco.MjModel, preset: RobotPreset) -> None:
-    """Slow the robot's joints down to what a preset allows, in place."""
+def limit_speeds(model: mujoco.MjModel, preset: RobotName) -> None:
+    """Limit the speeds of the robot's joints to those of a preset, in place.
+
+    MuJoCo has no speed limit. So the damping is set to balance the drive's largest force at the limit.
+    """
     if preset == "usst":
         for joint, limit in enumerate(USST_SPEED_LIMITS):
             model.dof_damping[joint] = model.actuator_forcerange[joint, 1] / limit
@@ -61,7 +63,7 @@ def inertia_at_home(model: mujoco.MjModel) -> Array:
     return inertia[:7, :7]
 
 
-def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
+def home_action(preset: RobotName = "rails") -> npt.NDArray[np.float32]:
     """Return the action (7,) that holds the home pose."""
     model = load_model(preset)
     limits = np.array(model.actuator_ctrlrange)
@@ -73,21 +75,21 @@ def home_action(preset: RobotPreset = "rails") -> npt.NDArray[np.float32]:
 
 
 class RobotBatch:
-    """B simulations of the robot on one thread.
+    """B simulations of the robot.
 
     Args:
         count: B.
         preset: See ``load_model``.
-        control_rate_hz: Control steps a second; its period must be a multiple of MuJoCo's step.
+        control_rate_hz: Control steps a second. The control period must be a multiple of MuJoCo's step.
         step: MuJoCo's time step [s]; None: the default for this control rate.
-        threads: MuJoCo threads; 1 keeps an actor on one core.
-        model: A model whose first seven joints and actuators are the robot's, in place of the robot alone.
+        threads: MuJoCo threads. With 1 an actor uses one core.
+        model: A model whose first seven joints and actuators are the robot's; None: the robot alone.
     """
 
     def __init__(
         self,
         count: int,
-        preset: RobotPreset = "rails",
+        preset: RobotName = "rails",
         control_rate_hz: float = 50.0,
         step: float | None = None,
         threads: int = 1,
@@ -118,7 +120,7 @@ class RobotBatch:
         self.torque_limit: Array = np.array(self.model.actuator_forcerange[:, 1])
         self.home: Array = np.array(self.model.key("home").qpos[:7])
         self.home_action: Array = (self.home - self.middle) / self.half_range
-        # Gains and damping differ from rally to rally.
+        # Gains and damping differ between rallies
         self._kp: Array = np.array(self.model.actuator_gainprm[:, 0])
         self._kv: Array = -np.array(self.model.actuator_biasprm[:, 2])
         self._damping_nominal: Array = np.array(self.model.dof_damping[:7])
@@ -127,8 +129,10 @@ class RobotBatch:
         self._damping: Array = self.batch.expand("dof_damping")
         self._time: Array = self.batch.bind("time")
         self.faulty: Rows = np.zeros(0, np.int64)
-        # Targets of the control steps before this one, newest first: a latency may exceed a control period.
-        self._held: Array = np.tile(self.home, (math.ceil(MAX_ACTION_LATENCY / period - 1e-9), count, 1))
+        # Targets of earlier control steps, newest first: a latency may be longer than a control period
+        self._earlier_targets: Array = np.tile(
+            self.home, (math.ceil(MAX_ACTION_LATENCY / period - 1e-9), count, 1)
+        )
         self._late_substeps = np.zeros(count, np.int64)
         self._substep_index = np.arange(self.substeps)
         self._control = np.empty((count, self.substeps, 7))
@@ -137,13 +141,13 @@ class RobotBatch:
         self.go_home(np.arange(count), np.zeros((count, 7)))
 
     def go_home(self, rows: Rows, offset: Array) -> None:
-        """Put robots ``rows`` at rest at home plus ``offset`` (n, 7) [m, rad]."""
+        """Put robots ``rows`` at home plus ``offset`` (n, 7) [m, rad], at rest."""
         self.batch.reset(ids=rows, keyframe=0, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self.joint_pos[rows] = self.home + offset
-        self._held[:, rows] = self.home
+        self._earlier_targets[:, rows] = self.home
 
     def set_gains(self, rows: Rows, factors: Array, action_latency: Array) -> None:
-        """Give robots ``rows`` their drives: factors of kp, kv, damping (n, 3, 7) and latency [s] (n,)."""
+        """Set the drives of robots ``rows``: factors of kp, kv and damping (n, 3, 7), action latency [s] (n,)."""
         kp = self._kp * factors[:, 0]
         self._gain[rows, :, 0] = kp
         self._bias[rows, :, 1] = -kp
@@ -153,38 +157,38 @@ class RobotBatch:
 
     @property
     def drives(self) -> Array:
-        """``common.rally.hindsight``'s table of the drives (5, 7): inertia at home, k_p, k_v, damping, half-range."""
+        """The drives (5, 7) as in ``DriveHistory.drives``: inertia at home, k_p, k_v, joint damping, half-range."""
         inertia = np.diag(inertia_at_home(self.model))
         return np.stack([inertia, self._kp, self._kv, self._damping_nominal, self.half_range])
 
     def push_racket(self, impulse: Array) -> None:
-        """Apply (B, 6) impulses [N s, N m s] about the racket's centre, spread over the next control step."""
+        """Apply impulses (B, 6) [N s, N m s] at the racket's centre, spread over the next control step."""
         self._wrench[:, self._racket] = impulse * (1.0 / (self.substeps * self.step_s))
 
-    def step(self, actions: Array) -> Motion:
+    def step(self, actions: Array) -> RobotMotion:
         """Return the motion of one control step under ``actions`` (B, 7) in [-1, 1].
 
-        Robots that MuJoCo gave up on stand at home afterwards; ``faulty`` names them until the next step.
+        If MuJoCo reset a simulation, its robot is at home afterwards. ``faulty`` has these rows until the next step.
         """
         target = self.middle + self.half_range * actions
         self._start[:] = self.joint_pos
-        self._time[:] = _UNDER_WAY
+        self._time[:] = _START_TIME
         np.copyto(self._control, target[:, None, :])
-        for age, held in enumerate(self._held):
+        for age, earlier in enumerate(self._earlier_targets):
             late = self._substep_index < self._late_substeps[:, None] - age * self.substeps
-            np.copyto(self._control, held[:, None, :], where=late[:, :, None])
-        self._held[1:] = self._held[:-1]
-        self._held[0] = target
+            np.copyto(self._control, earlier[:, None, :], where=late[:, :, None])
+        self._earlier_targets[1:] = self._earlier_targets[:-1]
+        self._earlier_targets[0] = target
         r = self._records = self._advance(self._control)
-        # MuJoCo resets a simulation that meets NaN or huge numbers: its time starts at 0 again.
-        behind = _UNDER_WAY + self.substeps * self.step_s - self._time
-        self.faulty = np.flatnonzero(~(np.abs(behind) < 0.5 * self.step_s))
+        # MuJoCo resets a simulation with NaN or huge numbers: its time starts at 0 again
+        missing_time = _START_TIME + self.substeps * self.step_s - self._time
+        self.faulty = np.flatnonzero(~(np.abs(missing_time) < 0.5 * self.step_s))
         if self.faulty.size:
             self._recover(self.faulty)
-        return Motion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)
+        return RobotMotion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)
 
     def _advance(self, control: Array) -> dict[str, Array]:
-        """Return records (B, substeps, ...) of a control step under joint targets (B, substeps, 7)."""
+        """Return MuJoCo's records (B, substeps, ...) of a control step under joint targets (B, substeps, 7)."""
         records: dict[str, Array] = self.batch.rollout(
             self.substeps,
             control=control,
@@ -195,7 +199,7 @@ class RobotBatch:
         return records
 
     def _recover(self, rows: Rows) -> None:
-        """Stand robots ``rows`` at home, at rest, as if they had been there for the whole control step."""
+        """Put robots ``rows`` at home, at rest, as if they had been there for the whole control step."""
         log.warning("robots sent home after a simulation fault count=%d first=%d", rows.size, rows[0])
         self.go_home(rows, np.zeros((rows.size, 7)))
         self._start[rows] = self.home

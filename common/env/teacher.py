@@ -1,38 +1,36 @@
-"""A policy that says what it would have done in another's place, and what is worth writing down.
+"""A teacher: a policy that gives the actions that it would take in the student's situation (ADR-0033).
 
-A pupil that sees the ball as it is now, and remembers nothing, can't tell how it spins: that shows in how the flight
-bends. But it sees its own arm, and before the stroke two of its joints are free. So where notes are asked for, the
-teacher says to hold them, until shortly before the stroke, where the ball was and how it flew as the pupil saw it
-first: writing is a function of the ball, holding one of the joints, and reading is up to the pupil.
+Arm memory (ADR-0034): the curve of the flight shows the ball's spin. A student without memory, which observes only the
+ball now, cannot see it. But the student observes its own arm, and two of its joints are free before the stroke. With
+``arm_memory`` the teacher holds these joints, until shortly before the stroke, at a function of the ball's first
+measurements. So the student writes from the ball, holds from the joints, and learns by itself to read them.
 """
 
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from common.env.rally_env import EnvConfig, RallyEnv
+from common.env.rally_env import RallyEnv
 from common.env.robot import JOINTS
 from common.physics.constants import GRID_STEP, TABLE_HALF_LENGTH
-from common.policy.weights import Policy, PolicyError, load_policy
-from common.rally.observation import (
-    OBSERVATION,
-    ObservationConfig,
-    offsets,
-    policy_layout,
-)
+from common.policy.box import policy_folder
+from common.policy.contract import PolicyError
+from common.policy.folder import Policy, load_policy
+from common.task.config import TaskConfig
+from common.task.experience import TeacherConfig
+from common.task.observation import OBSERVATION, ObservationConfig, offsets, policy_layout
 
 Floats = npt.NDArray[np.float32]
 
 _AT = offsets(OBSERVATION)
 _TARGET = _AT["target"]
-COMING = _AT["continuous_state"].start  # tau_01: launched, and not seen to have bounced
+COMING: Final = _AT["continuous_state"].start  # tau_01: launched, and the bounce is not yet measured
 _MIDDLE = np.array([0.5 * TABLE_HALF_LENGTH, 0.0], np.float32)
 
 
-class Note(NamedTuple):
-    """What a joint holds: home + gain (number - middle) [half-range]."""
+class MemoryJoint(NamedTuple):
+    """A joint that holds a number of the observation: at home + gain (number - middle) [half-range]."""
 
     joint: int
     number: int  # of the observation
@@ -40,86 +38,88 @@ class Note(NamedTuple):
     gain: float
 
 
-NOTES: Final = (
-    Note(JOINTS.index("roll"), _AT["ball_vel"].start + 1, 0.0, 0.22),  # y [m/s]: sidespin bends it
-    Note(JOINTS.index("wrist"), _AT["ball_pos"].start + 2, 0.48, 0.8),  # z [m]: topspin makes it fall
+MEMORY: Final = (
+    MemoryJoint(JOINTS.index("roll"), _AT["ball_vel"].start + 1, 0.0, 0.22),  # y [m/s]: sidespin bends it
+    MemoryJoint(JOINTS.index("wrist"), _AT["ball_pos"].start + 2, 0.48, 0.8),  # z [m]: topspin makes it fall
 )
-"""Of fast joints, which a stroke needs last. Balls as they are launched take up a third to all of their range."""
+"""Fast joints that a stroke needs last. The launches of the presets use between a third and all of their range."""
 
-NOTE_JOINTS: Final = [note.joint for note in NOTES]
+MEMORY_JOINTS: Final = [memory.joint for memory in MEMORY]
 
-FIRST_SEEN: Final = 0.05  # [s] after the launch notes are written
-STROKE: Final = 0.24  # [s] before a ball is met the joints are wanted for it
-_LARGEST: Final = 0.95  # [half-range]
+FIRST_MEASURED: Final = 0.05  # [s] time after the launch during which the memory is written
+STROKE: Final = 0.24  # [s] time before the interception from which on the stroke needs the joints
+_LARGEST: Final = 0.95  # [half-range] largest target of a joint that holds a number
 
 
 class Teacher:
-    """A policy that looks on while another plays.
+    """A policy that observes the rallies that another policy plays.
 
     Args:
-        policy: It, read from its folder.
-        towards_middle: Share of the way to the middle of the opponent's court by which targets are moved for it.
-        notes: Whether it has its pupil take notes.
+        policy: The teacher.
+        target_shrink: Share of the way to the middle of the opponent's court by which its targets are moved.
+        arm_memory: Whether free joints are held as memory.
     """
 
-    def __init__(self, policy: Policy, towards_middle: float = 0.0, notes: bool = False) -> None:
-        self._policy, self._towards_middle = policy, towards_middle
-        self._has_notes_taken = notes
-        self._notes = np.zeros(len(NOTES), np.float32)  # (B, notes) from the first rallies on
-        self._seen_at = offsets(policy_layout(self.sees))
+    def __init__(self, policy: Policy, target_shrink: float = 0.0, arm_memory: bool = False) -> None:
+        self._policy, self._target_shrink = policy, target_shrink
+        self._has_arm_memory = arm_memory
+        self._memory = np.zeros(len(MEMORY), np.float32)  # (B, joints) from the first rallies on
+        self._at = offsets(policy_layout(self.observation))
 
     @property
-    def sees(self) -> ObservationConfig:
-        """What it must be shown: the environment's onlooker."""
-        return self._policy.contract.observation_options
+    def observation(self) -> ObservationConfig:
+        """What the teacher observes: the environment's extra observation."""
+        return self._policy.contract.task.observation
 
-    def advice(self, env: RallyEnv, shown: Floats) -> Floats:
-        """Return what it would do now (B, 7), within [-1, 1].
+    def advice(self, env: RallyEnv, student_obs: Floats) -> Floats:
+        """Return the teacher's actions now (B, 7), within [-1, 1].
 
         Args:
-            env: The rallies; the same from call to call, a control step on.
-            shown: What the pupil sees of them (B, D).
+            env: The same rallies in each call, one control step later each time.
+            student_obs: What the student observes (B, D).
         """
-        seen = env.look_on()
-        seen[:, _TARGET] += self._towards_middle * (_MIDDLE - seen[:, _TARGET])
-        advice = np.clip(self._policy.act(seen), -1.0, 1.0)
-        if self._has_notes_taken:
-            self._dictate(env, shown, seen[:, self._seen_at["meeting_in"].start], advice)
+        obs = env.observe_extra()
+        obs[:, _TARGET] += self._target_shrink * (_MIDDLE - obs[:, _TARGET])
+        advice = np.clip(self._policy.act(obs), -1.0, 1.0)
+        if self._has_arm_memory:
+            self._hold_memory(env, student_obs, obs[:, self._at["interception_in"].start], advice)
         return advice
 
-    def _dictate(self, env: RallyEnv, shown: Floats, meeting_in: Floats, advice: Floats) -> None:
-        """Put into ``advice`` what joints that are still free should hold."""
-        numbers = shown[:, [note.number for note in NOTES]]
-        is_new = env.rallies.clock * GRID_STEP < FIRST_SEEN
-        self._notes = np.where(is_new[:, None], numbers, self._notes)
-        is_free = (meeting_in > STROKE) & (shown[:, COMING] > 0.5)
-        for k, note in enumerate(NOTES):
-            held = env.home_action[note.joint] + note.gain * (self._notes[:, k] - note.middle)
-            advice[:, note.joint] = np.where(is_free, held.clip(-_LARGEST, _LARGEST), advice[:, note.joint])
+    def _hold_memory(
+        self, env: RallyEnv, student_obs: Floats, interception_in: Floats, advice: Floats
+    ) -> None:
+        """Write the targets of joints that are still free into ``advice``."""
+        numbers = student_obs[:, [memory.number for memory in MEMORY]]
+        is_new = env.rallies.clock * GRID_STEP < FIRST_MEASURED
+        self._memory = np.where(is_new[:, None], numbers, self._memory)
+        is_free = (interception_in > STROKE) & (student_obs[:, COMING] > 0.5)
+        for k, memory in enumerate(MEMORY):
+            held = env.home_action[memory.joint] + memory.gain * (self._memory[:, k] - memory.middle)
+            advice[:, memory.joint] = np.where(
+                is_free, held.clip(-_LARGEST, _LARGEST), advice[:, memory.joint]
+            )
 
 
-def teacher_of(task: EnvConfig) -> Teacher | None:
-    """Return a task's teacher, or None where it has none. What spins it is told to expect is the task's.
+def teacher_of(task: TaskConfig, config: TeacherConfig) -> Teacher | None:
+    """Return the teacher, or None without one. It expects the same spin as the task.
 
     Raises:
-        PolicyError: It can't be read, or couldn't play the task itself.
+        PolicyError: The policy can't be read, or can't play the task itself.
     """
-    if not task.teacher.policy:
+    if not config.policy:
         return None
-    policy = load_policy(Path(task.teacher.policy))
-    contract, history = policy.contract, policy.contract.observation_options.history
-    for name, theirs, ours in (
-        ("control_rate_hz", contract.control_rate_hz, task.control_rate_hz),
-        ("robot", contract.robot, task.robot),
-        ("observation.history", history, task.observation.history),
+    policy = load_policy(policy_folder(config.policy))
+    theirs = policy.contract.task
+    for name, found, wanted in (
+        ("control_rate_hz", theirs.control_rate_hz, task.control_rate_hz),
+        ("robot", theirs.robot, task.robot),
+        ("observation.history", theirs.observation.history, task.observation.history),
     ):
-        if theirs != ours:
-            raise PolicyError(
-                f"teacher {task.teacher.policy}: {name} is {theirs}; allowed is the task's, {ours}"
-            )
-    if task.teacher.notes and not contract.observation_options.prediction:
+        if found != wanted:
+            raise PolicyError(f"teacher {config.policy}: {name} is {found}; allowed: the task's, {wanted}")
+    if config.arm_memory and not theirs.observation.prediction:
         raise PolicyError(
-            f"teacher {task.teacher.policy}: observation.prediction is False; allowed with teacher.notes is True: "
-            "joints are free until it knows a ball is about to be met"
+            f"teacher {config.policy}: observation.prediction is False; allowed with teacher.arm_memory: True, since "
+            "joints are free until the teacher predicts the interception"
         )
-    return Teacher(policy, task.teacher.towards_middle, task.teacher.notes)
+    return Teacher(policy, config.target_shrink, config.arm_memory)

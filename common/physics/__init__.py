@@ -1,1 +1,1 @@
-"""Ball physics: flight, bounces, and what the ball touches when. Pure numpy and numba."""
+"""Physics of the ball: flight, bounces, and the times of its contacts. Only numpy and numba."""

@@ -1,12 +1,12 @@
-"""Where the robot's racket and links are, from its seven joints (the lengths of ``common/env/robot.xml``).
+"""Kinematics of the robot: poses of racket and links from its seven joints (the lengths of ``common/env/robot.xml``).
 
-The ball flies outside MuJoCo, so its kernels need the robot's pose at any moment inside a MuJoCo step. Joint
-positions are interpolated linearly between steps (MuJoCo's semi-implicit step moves them just so), and the
-chain of two rails, yaw, three pitching joints and roll is evaluated here: exact, rigid at every moment, and
-some 30 times cheaper than recording MuJoCo's own frames. A test holds it to ``mj_forward``.
+The ball flies outside MuJoCo, so its kernels need the robot's pose at any moment inside a MuJoCo step (ADR-0005).
+Joint positions are interpolated linearly between steps, as MuJoCo's semi-implicit step moves them. This file
+evaluates the chain of two rails, yaw, three pitching joints and roll. The result is exact, rigid at every moment,
+and about 30 times cheaper than a recording of MuJoCo's own frames. A test compares it with ``mj_forward``.
 
 Angles: a = pitch, b = pitch + elbow, c = pitch + elbow + wrist, measured from the vertical towards the
-opponent. The racket's frame has x along the face's normal (towards the opponent at home), z towards the handle.
+opponent. In the racket's frame x is the face's normal (towards the opponent at home), and z points to the handle.
 """
 
 import math
@@ -21,8 +21,8 @@ from common.physics.vec import Vec, axpy, cross, scale
 Array = npt.NDArray[np.float64]
 Joints = tuple[float, float, float, float, float, float, float]
 
-RAIL_HOME_X = -1.45  # [m] beam's x at rail_x = 0
-SHOULDER_Z = 0.33  # [m] pitch axis above the table top
+RAIL_HOME_X = -1.45  # [m] x of the beam at rail_x = 0
+SHOULDER_Z = 0.33  # [m] height of the pitch axis over the table top
 UPPER_ARM = 0.22  # [m] pitch axis to elbow axis
 FOREARM = 0.20  # [m] elbow axis to wrist axis
 RACKET_REACH = 0.14  # [m] wrist axis to the racket's centre
@@ -30,7 +30,7 @@ RACKET_RADIUS = 0.076  # [m]
 RACKET_HALF_THICKNESS = 0.0065  # [m]
 HANDLE_LENGTH = RACKET_REACH - RACKET_RADIUS  # [m] wrist axis to the blade's rim
 
-UPPER_ARM_RADIUS = 0.035  # [m] radii of the capsules a ball can hit
+UPPER_ARM_RADIUS = 0.035  # [m] radii of the capsules that a ball can hit
 FOREARM_RADIUS = 0.030
 WRIST_RADIUS = 0.025
 COLUMN_RADIUS = 0.045
@@ -41,11 +41,11 @@ BEAM_HALF_LENGTH = 1.1
 REACH = (
     UPPER_ARM + FOREARM + RACKET_REACH + RACKET_RADIUS + 0.002
 )  # [m] shoulder to the rim, with its thickness
-"""No point of arm or racket is farther from the pitch axis than this."""
+"""Largest distance of a point of arm or racket from the pitch axis."""
 
 
 class RacketPose(NamedTuple):
-    """The racket at one moment, world frame: its centre and the three axes of its frame."""
+    """The racket at one moment in the world frame: its centre and the three axes of its frame."""
 
     centre: Vec
     normal: Vec  # x axis: the face's normal
@@ -55,7 +55,7 @@ class RacketPose(NamedTuple):
 
 @kernel
 def joints_at(trajectory: Array, moment: float, step: float) -> Joints:
-    """Return the seven joint positions [m, rad] at a moment, linear between the rows of ``trajectory``.
+    """Return the seven joint positions [m, rad] at a moment, interpolated linearly between rows of ``trajectory``.
 
     Args:
         trajectory: Joint positions at times 0, step, 2 step ... (n, 7).
@@ -78,10 +78,10 @@ def joints_at(trajectory: Array, moment: float, step: float) -> Joints:
 
 @kernel
 def joint_rates_at(trajectory: Array, moment: float, step: float) -> Joints:
-    """Return the joint velocities [m/s, rad/s] of the very path that ``joints_at`` describes.
+    """Return the joint velocities [m/s, rad/s] of the path of ``joints_at``.
 
-    Not MuJoCo's velocities blended: a racket whose velocity differed from its path's slope could be met by a ball
-    that, by that velocity, it is leaving.
+    These are not MuJoCo's velocities, interpolated. With those, the racket's velocity would differ from the slope of
+    its path, and a ball could touch a racket whose velocity points away from it.
     """
     row = min(max(int(moment / step), 0), trajectory.shape[0] - 2)
     a, b = trajectory[row], trajectory[row + 1]
@@ -98,7 +98,7 @@ def joint_rates_at(trajectory: Array, moment: float, step: float) -> Joints:
 
 @kernel
 def shoulder(q: Joints) -> Vec:
-    """Return where the yaw and pitch axes meet."""
+    """Return the point where the yaw and pitch axes meet [m]."""
     return (RAIL_HOME_X + q[0], q[1], SHOULDER_Z)
 
 
@@ -111,7 +111,7 @@ def _along(cos_yaw: float, sin_yaw: float, angle: float) -> Vec:
 
 @kernel
 def links(q: Joints) -> tuple[Vec, Vec, Vec, Vec, Vec]:
-    """Return shoulder, elbow, wrist, the handle's end at the blade, and the racket's centre."""
+    """Return shoulder, elbow, wrist, the handle's end at the blade, and the racket's centre [m]."""
     cos_yaw, sin_yaw = math.cos(q[2]), math.sin(q[2])
     p_shoulder = shoulder(q)
     elbow = axpy(UPPER_ARM, _along(cos_yaw, sin_yaw, q[3]), p_shoulder)
@@ -130,7 +130,7 @@ def racket_pose(q: Joints) -> RacketPose:
     p = axpy(UPPER_ARM, _along(cos_yaw, sin_yaw, q[3]), shoulder(q))
     p = axpy(FOREARM, _along(cos_yaw, sin_yaw, q[3] + q[4]), p)
     centre = axpy(RACKET_REACH, hand, p)
-    # Columns of Rz(yaw) Ry(c - pi): forward, left, up; then turned by -roll about up.
+    # Columns of Rz(yaw) Ry(c - pi): forward, left, up. Then a turn by -roll about up.
     cos_c, sin_c = math.cos(c), math.sin(c)
     forward = (-cos_yaw * cos_c, -sin_yaw * cos_c, sin_c)
     left = (-sin_yaw, cos_yaw, 0.0)
@@ -147,7 +147,7 @@ def racket_motion(q: Joints, qd: Joints) -> tuple[Vec, Vec]:
     a_rate, b_rate, c_rate = qd[3], qd[3] + qd[4], qd[3] + qd[4] + qd[5]
     sin_a, cos_a, sin_b, cos_b = math.sin(a), math.cos(a), math.sin(b), math.cos(b)
     sin_c, cos_c = math.sin(c), math.cos(c)
-    # In the arm's plane: radius from the yaw axis, its rate and the height's rate.
+    # In the arm's plane: radius from the yaw axis, its rate and the rate of the height.
     radius = UPPER_ARM * sin_a + FOREARM * sin_b + RACKET_REACH * sin_c
     radius_rate = UPPER_ARM * cos_a * a_rate + FOREARM * cos_b * b_rate + RACKET_REACH * cos_c * c_rate
     height_rate = -(UPPER_ARM * sin_a * a_rate + FOREARM * sin_b * b_rate + RACKET_REACH * sin_c * c_rate)
@@ -182,7 +182,7 @@ def racket_quaternion(q: Joints) -> tuple[float, float, float, float]:
 
 @kernel
 def point_velocity(centre: Vec, vel: Vec, angular: Vec, point: Vec) -> Vec:
-    """Return a racket point's velocity V_R + W_R x (p - p_R)."""
+    """Return the velocity V_R + W_R x (p - p_R) of a point of the racket [m/s]."""
     arm = (point[0] - centre[0], point[1] - centre[1], point[2] - centre[2])
     turn = cross(angular, arm)
     return (vel[0] + turn[0], vel[1] + turn[1], vel[2] + turn[2])
@@ -190,12 +190,12 @@ def point_velocity(centre: Vec, vel: Vec, angular: Vec, point: Vec) -> Vec:
 
 @kernel
 def speed_bound(trajectory: Array, step: float) -> float:
-    """Return a speed [m/s] that no point of the robot exceeds along ``trajectory`` (n, 7)."""
+    """Return an upper bound of the speed [m/s] of all points of the robot along ``trajectory`` (n, 7)."""
     bound = 0.0
     for k in range(trajectory.shape[0] - 1):
         a, b = trajectory[k], trajectory[k + 1]
-        way = abs(b[0] - a[0]) + abs(b[1] - a[1]) + (abs(b[2] - a[2]) + abs(b[3] - a[3])) * REACH
-        way += abs(b[4] - a[4]) * (REACH - UPPER_ARM) + abs(b[5] - a[5]) * (RACKET_REACH + RACKET_RADIUS)
-        way += abs(b[6] - a[6]) * RACKET_RADIUS
-        bound = max(bound, way / step)
+        distance = abs(b[0] - a[0]) + abs(b[1] - a[1]) + (abs(b[2] - a[2]) + abs(b[3] - a[3])) * REACH
+        distance += abs(b[4] - a[4]) * (REACH - UPPER_ARM) + abs(b[5] - a[5]) * (RACKET_REACH + RACKET_RADIUS)
+        distance += abs(b[6] - a[6]) * RACKET_RADIUS
+        bound = max(bound, distance / step)
     return bound

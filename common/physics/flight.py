@@ -2,11 +2,12 @@
 
     a = -g z + (rho A/2m) (-C_D |v| v + C_L |v|^2 w^ x v^),    S = r|w|/|v|
 
-Two models of the coefficients. On 1,597 recorded flights of 0.3 s the simple one lands 40 mm (median) from
-the truth and the full one 35 mm; drag alone lands 188 mm away, and a lift that never saturates 65 mm.
+There are two models of the coefficients. On 1,597 recorded flights of 0.3 s the median error of the landing is 40 mm
+with the simple model and 35 mm with the full one. With drag alone it is 188 mm, with a lift that never saturates 65 mm.
 """
 
-from typing import Final
+from enum import IntEnum
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -14,8 +15,25 @@ from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, AIR_VOLUME_FACTOR, BALL_RADIUS, GRAVITY
 from common.physics.vec import Vec, axpy, cross, norm
 
-SIMPLE: Final = 0
-FULL: Final = 1
+
+class Flight(IntEnum):
+    """Model of the aerodynamic coefficients."""
+
+    SIMPLE = 0
+    FULL = 1
+
+
+SIMPLE: Final = int(Flight.SIMPLE)  # kernels compare plain integers
+FULL: Final = int(Flight.FULL)
+
+
+class Air(NamedTuple):
+    """The air of one rally."""
+
+    drag_factor: float  # [-] multiplies C_D, nominal 1
+    lift_factor: float  # [-] multiplies C_L and its saturation value, nominal 1
+    model: int  # ``SIMPLE`` or ``FULL``
+
 
 # Simple model: Sony's earlier model, as cited by Conti et al. 2026. Lift saturates at S = 0.25.
 SIMPLE_DRAG: Final = 0.55  # [-] C_D
@@ -40,16 +58,23 @@ DRAG_VALUES: Final = np.array(
         [0.47, 0.47, 0.51, 0.37, 0.45, 0.45],
     ]
 )
-DRAG_MIN: Final = 0.3  # [-] ours: the table ends at 17.5 m/s, and its extrapolation must not run away
+DRAG_MIN: Final = 0.3  # [-] our limit: the table ends at 17.5 m/s, and its extrapolation needs one
 
-# Full model: C_M(|v|, |w|), Conti et al. 2026: per speed [m/s], a line m_1 w + c_1 up to w_b, a parabola
-# a w^2 + b w + c above (they miss each other by up to 0.022 at w_b)
+# Full model: C_M(|v|, |w|), Conti et al. 2026: per speed [m/s], a line m_1 w + c_1 up to w_b, and from there a
+# parabola a w^2 + b w + c (at w_b they differ by up to 0.022)
 MAGNUS_SPEEDS: Final = np.array([2.0, 3.5, 7.5, 10.5, 13.5, 17.0])
 MAGNUS_PARAMETERS: Final = np.array(
     [  #  m_1       c_1   w_b      a          b          c
         [0.0, 0.080, 150.0, -1.852e-7, -1.296e-4, 0.09833],
         [-1.10e-3, 0.310, 200.0, -1.667e-7, -3.333e-5, 0.1000],
-        [-7.75e-4, 0.366, 350.0, -2.000e-7, 1.700e-4, 0.05875],  # from the authors' code; the paper rounds
+        [
+            -7.75e-4,
+            0.366,
+            350.0,
+            -2.000e-7,
+            1.700e-4,
+            0.05875,
+        ],  # from the authors' code; the paper rounds them
         [-6.58e-4, 0.375, 440.0, -2.604e-7, 3.646e-4, -0.02250],
         [-5.60e-4, 0.383, 550.0, -3.571e-7, 5.357e-4, -0.08929],
         [-4.48e-4, 0.371, 650.0, -1.000e-7, 2.300e-4, -0.03750],
@@ -61,8 +86,8 @@ MAGNUS_PARAMETERS: Final = np.array(
 def full_drag(speed: float, spin_parameter: float) -> float:
     """Return C_D(|v|, S) of the full model [-]: linear in S and in |v|, knots and values alike.
 
-    Below 2.5 m/s the first row holds. Above 17.5 m/s the values go on along the slope of the last two rows,
-    while the knots stay: extrapolated they would cross at 22 m/s.
+    At less than 2.5 m/s the first row holds. At more than 17.5 m/s the values are extrapolated along the slope of the
+    last two rows, and the knots stay: extrapolated knots would cross at 22 m/s.
     """
     row = 0
     while row < DRAG_SPEEDS.size - 2 and speed >= DRAG_SPEEDS[row + 1]:
@@ -84,7 +109,7 @@ def full_drag(speed: float, spin_parameter: float) -> float:
 
 @kernel
 def full_magnus(speed: float, spin_rate: float) -> float:
-    """Return C_M(|v|, |w|) of the full model [-]: parameters linear in |v|, held outside 2-17 m/s, never < 0.
+    """Return C_M(|v|, |w|) of the full model [-]: parameters linear in |v|, constant outside 2-17 m/s, never < 0.
 
     C_M is Conti's coefficient per volume: a = (rho V/m) C_M (w x v); C_L = (8/3) C_M S for a spin across v.
     """
@@ -106,21 +131,19 @@ def full_magnus(speed: float, spin_rate: float) -> float:
 
 
 @kernel
-def acceleration(vel: Vec, spin: Vec, drag_factor: float, lift_factor: float, model: int) -> Vec:
+def acceleration(vel: Vec, spin: Vec, air: Air) -> Vec:
     """Return the acceleration of a ball in flight [m/s^2].
 
     Args:
         vel: v [m/s].
         spin: w [rad/s].
-        drag_factor: Multiplies C_D, drawn per rally, nominal 1.
-        lift_factor: Multiplies C_L (its saturation too), drawn per rally, nominal 1.
-        model: ``SIMPLE`` or ``FULL``.
+        air: Of the rally.
     """
     speed = norm(vel)
     spin_rate = norm(spin)
-    # a = -drag v + lift (w x v) - g z: the quotients by |v| and |w| are cancelled, so that a ball at rest and
-    # a ball without spin need no case of their own
-    if model == SIMPLE:
+    # a = -drag v + lift (w x v) - g z. The divisions by |v| and |w| are cancelled, so a ball at rest and a ball
+    # without spin need no special case
+    if air.model == SIMPLE:
         drag = AIR_FACTOR * SIMPLE_DRAG * speed
         lift = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
         if SIMPLE_LIFT_SLOPE * BALL_RADIUS * spin_rate > SIMPLE_LIFT_MAX * speed:
@@ -129,8 +152,8 @@ def acceleration(vel: Vec, spin: Vec, drag_factor: float, lift_factor: float, mo
         spin_parameter = BALL_RADIUS * spin_rate / speed if speed > 0.0 else 0.0
         drag = AIR_FACTOR * full_drag(speed, spin_parameter) * speed
         lift = AIR_VOLUME_FACTOR * full_magnus(speed, spin_rate)
-    drag *= drag_factor
-    lift *= lift_factor
+    drag *= air.drag_factor
+    lift *= air.lift_factor
     magnus = cross(spin, vel)
     return (
         lift * magnus[0] - drag * vel[0],
@@ -140,28 +163,24 @@ def acceleration(vel: Vec, spin: Vec, drag_factor: float, lift_factor: float, mo
 
 
 @kernel
-def flight_step(
-    pos: Vec, vel: Vec, spin: Vec, h: float, drag_factor: float, lift_factor: float, model: int
-) -> tuple[Vec, Vec]:
+def flight_step(pos: Vec, vel: Vec, spin: Vec, h: float, air: Air) -> tuple[Vec, Vec]:
     """Return position and velocity after ``h`` seconds of flight: one classical Runge-Kutta step.
 
     Args:
         pos: Of the ball's centre [m].
         vel: [m/s].
         spin: [rad/s], constant.
-        h: Step [s]; ``GRID_STEP`` wherever a rally must replay bit for bit.
-        drag_factor: See ``acceleration``.
-        lift_factor: See ``acceleration``.
-        model: ``SIMPLE`` or ``FULL``.
+        h: Step [s]; ``GRID_STEP`` where a rally must replay bit for bit.
+        air: Of the rally.
     """
     v_1 = vel
-    a_1 = acceleration(v_1, spin, drag_factor, lift_factor, model)
+    a_1 = acceleration(v_1, spin, air)
     v_2 = axpy(0.5 * h, a_1, vel)
-    a_2 = acceleration(v_2, spin, drag_factor, lift_factor, model)
+    a_2 = acceleration(v_2, spin, air)
     v_3 = axpy(0.5 * h, a_2, vel)
-    a_3 = acceleration(v_3, spin, drag_factor, lift_factor, model)
+    a_3 = acceleration(v_3, spin, air)
     v_4 = axpy(h, a_3, vel)
-    a_4 = acceleration(v_4, spin, drag_factor, lift_factor, model)
+    a_4 = acceleration(v_4, spin, air)
     sixth = h / 6.0
     return (
         (

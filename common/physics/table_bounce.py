@@ -8,20 +8,20 @@ from common.physics.vec import Vec, add, dot
 
 @kernel
 def table_restitution(normal_speed: float, restitution0: float) -> float:
-    """Return e_n = max(0.2, e_0 - 0.02 |v_n|): a harder impact dents the shell more (Conti et al. 2026)."""
+    """Return e_n = max(0.2, e_0 - 0.02 |v_n|): a faster impact dents the shell more (Conti et al. 2026)."""
     return max(MIN_RESTITUTION, restitution0 - TABLE_RESTITUTION_SLOPE * normal_speed)
 
 
 @kernel
 def table_bounce(vel: Vec, spin: Vec, normal: Vec, restitution0: float, friction: float) -> tuple[Vec, Vec]:
-    """Return velocity and spin just after the ball met the table (Nakashima, ACC 2010; Conti et al. 2026).
+    """Return velocity and spin just after a contact with the table (Nakashima, ACC 2010; Conti et al. 2026).
 
-    alpha = min(2/5, mu (1 + e_n)|v_n| / |c|): the ball leaves rolling, or it slides all through the contact.
+    alpha = min(2/5, mu (1 + e_n)|v_n| / |c|): the ball leaves rolling, or it slides during the whole contact.
 
     Args:
         vel: Just before, approaching: v.n < 0 [m/s].
         spin: Just before [rad/s].
-        normal: Unit normal n, to the side the ball is on: (0, 0, 1) on the table top.
+        normal: Unit normal n on the ball's side: (0, 0, 1) on the table top.
         restitution0: e_0 [-], nominal 0.98.
         friction: mu [-], nominal 0.25.
     """

@@ -1,8 +1,8 @@
-"""What the ball touches, and how far it is from it.
+"""Obstacles that the ball can touch, and its distance to them.
 
 Every obstacle is a *gap*: the distance [m] between the ball's surface and the obstacle's, negative inside, with
-the unit normal towards the ball. ``fly.py`` marches on these gaps by conservative advancement: a step of
-gap / (bound of the closing speed) can't pass through anything, however thin.
+the unit normal towards the ball. ``fly.py`` uses these gaps for conservative advancement (ADR-0006): a step of
+gap / (bound of the closing speed) can't pass through an obstacle, at any thickness.
 """
 
 import math
@@ -24,7 +24,7 @@ from common.physics.vec import Vec, axpy, dot, norm, scale, sub
 
 
 class Touch(IntEnum):
-    """What a ball can touch."""
+    """An obstacle that a ball can touch."""
 
     NONE = 0
     ROBOT_COURT = 1
@@ -34,14 +34,14 @@ class Touch(IntEnum):
     BODY = 5  # arm, handle, column or beam
     EDGE = 6  # the table's edges and sides
     FLOOR = 7
-    OUT = 8  # left the space any rally can come back from
+    OUT = 8  # left the space from which a rally can return
 
 
 # Kernels take plain integers.
 NONE, ROBOT_COURT, OPPONENT_COURT, NET, RACKET, BODY, EDGE, FLOOR, OUT = (int(t) for t in Touch)
 
 NET_HALF_THICKNESS = 0.003  # [m] cord and mesh
-PLAY_X = 3.6  # [m] beyond these no touch can follow but the floor's
+PLAY_X = 3.6  # [m] beyond these limits only the floor can be touched
 PLAY_Y = 2.3  # [m]
 
 
@@ -55,7 +55,7 @@ def _box_gap(pos: Vec, half_x: float, half_y: float, z_low: float, z_high: float
     )
     offset = sub(pos, nearest)
     distance = norm(offset)
-    if distance == 0.0:  # the centre itself is inside: no obstacle is entered that far from outside
+    if distance == 0.0:  # the centre is inside: a ball from outside never gets that far
         return -BALL_RADIUS, (0.0, 0.0, 1.0)
     return distance - BALL_RADIUS, scale(1.0 / distance, offset)
 
@@ -80,7 +80,7 @@ def floor_gap(pos: Vec) -> tuple[float, Vec]:
 
 @kernel
 def table_touch(pos: Vec) -> int:
-    """Return which part of the table a ball at gap zero touches: a court, or an edge."""
+    """Return the part of the table that a ball at gap zero touches: a court, or an edge."""
     if abs(pos[0]) > TABLE_HALF_LENGTH or abs(pos[1]) > TABLE_HALF_WIDTH or pos[2] < 0.0:
         return EDGE
     return ROBOT_COURT if pos[0] <= 0.0 else OPPONENT_COURT
@@ -99,7 +99,7 @@ def _capsule_gap(pos: Vec, start: Vec, end: Vec, radius: float) -> tuple[float, 
 def racket_gap(pos: Vec, racket: RacketPose) -> tuple[float, Vec]:
     """Return gap and normal of the racket: a flat disc thickened to a round rim.
 
-    On either face the normal is the face's; over the rim it turns outwards, so that an edge ball is deflected.
+    On both faces the normal is the face's. At the rim it turns outwards, so a ball on the edge is deflected.
     """
     offset = sub(pos, racket.centre)
     height = dot(offset, racket.normal)
@@ -116,7 +116,7 @@ def racket_gap(pos: Vec, racket: RacketPose) -> tuple[float, Vec]:
 
 @kernel
 def _rail_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
-    """Return gap and normal of what stands on the rails: beam and column."""
+    """Return gap and normal of beam and column."""
     x = arm.RAIL_HOME_X + q[0]
     beam, beam_normal = _capsule_gap(
         pos, (x, -arm.BEAM_HALF_LENGTH, arm.BEAM_Z), (x, arm.BEAM_HALF_LENGTH, arm.BEAM_Z), arm.BEAM_RADIUS
@@ -148,7 +148,7 @@ def body_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
 
 @kernel
 def robot_gap_bound(pos: Vec, q: Joints) -> float:
-    """Return a distance [m] that no part of the robot is nearer than, without any trigonometry."""
+    """Return a lower bound [m] of the gap to all parts of the robot, computed without trigonometry."""
     rails, _ = _rail_gap(pos, q)
     sphere = norm(sub(pos, arm.shoulder(q))) - arm.REACH - BALL_RADIUS
     return min(rails, sphere)

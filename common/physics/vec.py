@@ -1,4 +1,4 @@
-"""Vectors as tuples of three floats: they live in registers, so a kernel reads like its equations."""
+"""Vectors as tuples of three floats. They stay in registers, and a kernel reads like its equations."""
 
 import math
 
@@ -12,7 +12,7 @@ Vec = tuple[float, float, float]
 
 @kernel
 def vec_at(row: npt.NDArray[np.float64], at: int) -> Vec:
-    """Return the vector in columns ``at``, ``at + 1``, ``at + 2`` of a row."""
+    """Return the vector in columns ``at``, ``at + 1`` and ``at + 2`` of a row."""
     return (row[at], row[at + 1], row[at + 2])
 
 

@@ -1,4 +1,4 @@
-"""D2RL: a multi-layer perceptron whose hidden layers each see the observation again.
+"""D2RL: a multi-layer perceptron whose hidden layers each take the observation again.
 
 Sinha et al. 2020, "D2RL: Deep Dense Architectures in Reinforcement Learning": every hidden layer after the first
 takes [previous layer's output, observation]; output layers take the last hidden layer alone.

@@ -10,12 +10,12 @@ Floats = npt.NDArray[np.float32]
 
 CLIP = 5.0  # normalised values are clipped to +-5 (rl_games, and the paper's weights)
 EPSILON = 1e-5  # added to the variance
-SMALLEST_VARIANCE = 0.01  # a flag that is almost never up must not be blown up into the clip when it is
+SMALLEST_VARIANCE = 0.01  # a flag that is almost always 0 must not reach the clip when it is 1
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Mean and variance of everything seen so far."""
+    """Mean and variance of all data so far."""
 
     mean: Array  # (D,) or (): a value's moments are scalars
     var: Array  # (D,) population variance
@@ -23,7 +23,7 @@ class Moments:
 
     @staticmethod
     def initial(size: int) -> "Moments":
-        """Return mean 0 and variance 1 with the weight of a single sample, which data soon outvote."""
+        """Return mean 0 and variance 1 with the weight of a single sample, so that data soon dominate."""
         return Moments(np.zeros(size), np.ones(size), 1)
 
     @staticmethod
@@ -42,7 +42,7 @@ class Moments:
         return Moments(mean, squares / count, count)
 
     def first(self, size: int) -> "Moments":
-        """Return those of the first ``size`` numbers."""
+        """Return the moments of the first ``size`` numbers."""
         return Moments(self.mean[:size], self.var[:size], self.count)
 
     def recounted(self) -> "Moments":

@@ -1,1 +1,1 @@
-"""The rules of the task: states, touches, outcomes, launches, reward and layouts. Pure numpy and numba."""
+"""One control step of many rallies: state, flight and touches, perception, observation, reward, hit correction."""

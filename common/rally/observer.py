@@ -1,10 +1,12 @@
-"""What a policy sees, made of what a robot measures: the simulator's own observation, with no simulator about.
+"""The observation of a real robot: what a policy observes, from what the robot measures, without a simulator.
 
-observer = Observer(policy.contract.observation_options)
+```python
+observer = Observer(policy.contract.task.observation)
 observer.begin(target)  # for each ball
-while ...:  # at the policy's control rate
-obs = observer.observe(now, joint_pos, joint_vel, ball)
-action = policy.act(obs[None])[0]
+while playing:  # at the policy's control rate
+    obs = observer.observe(now, joint_pos, joint_vel, ball)
+    action = policy.act(obs[None])[0]
+```
 """
 
 from dataclasses import dataclass
@@ -12,35 +14,37 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from common.rally import play
-from common.rally.noise import PROFILES, Condition
-from common.rally.observation import ObservationConfig, policy_layout, size
-from common.rally.prediction import new_tracks
+from common.perception.flight_track import new_tracks
+from common.rally.observe import observation_flags, observe
+from common.rally.sensing import update_flight_filter
+from common.rally.state import allocate
+from common.task.observation import ObservationConfig, policy_layout, size
+from common.task.randomization import PROFILES, RallyParameter
 
 Floats = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
 class BallSample:
-    """The ball as it was perceived, by ``estimator`` or whatever the robot has; world frame."""
+    """A measurement of the ball in the world frame, from ``camera_filter`` or from the robot's own perception."""
 
     pos: tuple[float, float, float]  # m
     vel: tuple[float, float, float]  # m/s
     state: int  # 0 coming, 1 bounced on the robot's court, 2 hit, 3 landed
-    moment: float  # [s] when it was there, on the robot's clock
-    guessed: bool = False  # an estimate of too few shots to be followed yet: ``estimator.is_guess``
+    moment: float  # [s] time stamp, on the robot's clock
+    is_guess: bool = False  # the camera filter has too few detections yet: ``camera_filter.is_guess``
 
 
 class Observer:
     """Makes one robot's observations.
 
     Args:
-        options: What the policy sees: ``contract.observation_options``.
-        position_noise: Sigma of a sample's position a axis [m]; by default what policies are trained with.
-        velocity_noise: And of its velocity [m/s].
+        options: What the policy observes: ``contract.task.observation``.
+        position_noise: Standard deviation of a sample's position per axis [m]; default: as in training.
+        velocity_noise: Standard deviation of its velocity per axis [m/s].
 
     Raises:
-        ValueError: The policy was told the ball's true spin, which no robot can measure.
+        ValueError: The policy observes the ball's true spin, which no robot can measure.
     """
 
     def __init__(
@@ -55,16 +59,17 @@ class Observer:
             )
         self._options = options
         self._noise = position_noise, velocity_noise
-        self._rally, _ = play.allocate(1, options.history, tracks=new_tracks(1, options.spin_expected))
-        self._told = play.told_by(options)._replace(is_privileged=False)
+        self._rally, _ = allocate(1, options.history, tracks=new_tracks(1, options.expected_spin))
+        self._flags = observation_flags(options)._replace(is_privileged=False)
         self._is_first = True
 
     def begin(self, target: tuple[float, float]) -> None:
-        """Expect a new ball of the same other side, which is to land at ``target`` [m]: x in 0..1.37, y in -0.76..0.76.
+        """Begin a new ball of the same opponent. ``target`` is where to return it [m]: x in 0..1.37, y in -0.76..0.76.
 
-        What was learnt of how that side spins is kept (``spin_expected`` learnt); another one wants another Observer.
+        With ``expected_spin`` learnt the observer keeps what it has learnt about the opponent's spin. Make a new
+        Observer for a new opponent.
         """
-        self._rally.condition[0, [Condition.TARGET_X, Condition.TARGET_Y]] = target
+        self._rally.parameters[0, [RallyParameter.TARGET_X, RallyParameter.TARGET_Y]] = target
         self._is_first = True
 
     def observe(
@@ -73,28 +78,30 @@ class Observer:
         """Return the observation (D,) of a control step.
 
         Args:
-            now: On the clock of ``ball.moment`` [s].
-            joint_pos: (7,) ``observation.JOINT_RANGES``' order [m, rad].
+            now: Time now on the clock of ``ball.moment`` [s].
+            joint_pos: (7,) in the order of ``observation.JOINT_RANGES`` [m, rad].
             joint_vel: (7,) [m/s, rad/s].
-            ball: The newest sample; the last one again, if none has come.
+            ball: The newest sample; if there is no new one, the last sample again.
         """
         rally = self._rally
-        seen, earlier = rally.seen[0], rally.earlier[0]
-        earlier[1:] = earlier[:-1].copy()
-        earlier[:1] = seen[:6]
-        # ``seen`` holds when the sample was taken as the environment does, since the rally's clock stands at 0: now
-        seen[:] = [*ball.pos, *ball.vel, ball.state, ball.moment - now]
+        measurement, history = rally.measurement[0], rally.measurement_history[0]
+        history[1:] = history[:-1].copy()
+        history[:1] = measurement[:6]
+        # The stamp is relative to the rally's clock, which stays at 0: now
+        measurement[:] = [*ball.pos, *ball.vel, ball.state, ball.moment - now]
         if self._is_first:
-            earlier[:] = seen[:6]
-        play.follow_flight(rally.track[0], seen, ball.moment, now, self._is_first, ball.guessed, *self._noise)
+            history[:] = measurement[:6]
+        update_flight_filter(
+            rally.track[0], measurement, ball.moment, now, self._is_first, ball.is_guess, *self._noise
+        )
         self._is_first = False
         obs = np.empty((1, size(policy_layout(self._options))), np.float32)
-        play.observe(
+        observe(
             rally,
             np.zeros(1, np.int64),
             np.array(joint_pos, np.float64).reshape(1, 7),
             np.array(joint_vel, np.float64).reshape(1, 7),
-            self._told,
+            self._flags,
             obs,
         )
         own: Floats = obs[0]

@@ -1,42 +1,71 @@
 """Settings of an actor."""
 
-from typing import Literal
+from typing import ClassVar, Final, Literal
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
-from common.rally.launch_presets import PresetName
-from common.service_config import ServiceConfig
+from common.service.settings import Fleet, ServiceConfig
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
 from services.actor.outbox import OutboxConfig
 
+ENVS: Final = 256  # environments that the actors of a run share
+FEWEST_ENVS: Final = 16  # of each actor
 
-class ActorConfig(ServiceConfig):
-    """Settings of an actor; task and network must be the learner's, or its rollouts are refused."""
 
-    env: EnvConfig = EnvConfig()
-    network: NetworkConfig = NetworkConfig()
+class ActorOptions(BaseModel):
+    """How an actor plays and sends."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
     outbox: OutboxConfig = OutboxConfig()
-    launch: PresetName = Field("paper", description="launch preset, as the generators'")
-    envs: int = Field(256, ge=1, le=65536, description="environments played together")
+    envs: int = Field(
+        0,
+        ge=0,
+        le=65536,
+        description=f"environments of each actor, played together; 0: the actors share {ENVS}, at least "
+        f"{FEWEST_ENVS} each (more than {ENVS // FEWEST_ENVS} actors make larger datasets)",
+    )
     horizon: int = Field(32, ge=1, le=4096, description="control steps of one rollout")
-    index: int = Field(
-        0, ge=0, description="number of this actor; decides its action noise and its rally shard"
-    )
-    shards: int = Field(
-        1, ge=1, le=4096, description="rally shards in all; this actor takes index mod shards"
-    )
     rallies: Literal["subscribe", "ask"] = Field(
         "subscribe",
-        description="take the rallies that are published, or ask for each block by index and wait for it "
+        description="subscribe: take the rallies that are published; ask: request each block by index and wait for it "
         "(reproducible bit for bit)",
     )
     rally_wait_s: float = Field(
-        10.0, gt=0, description="wait for a block that was asked for", json_schema_extra={"unit": "s"}
+        10.0, gt=0, description="wait for a requested block", json_schema_extra={"unit": "s"}
     )
     silence_warning_s: float = Field(
         10.0,
         gt=0,
-        description="idle time after which the log says who is waited for",
+        description="idle time after which the log says what the actor waits for",
         json_schema_extra={"unit": "s"},
     )
+
+
+class ActorConfig(ServiceConfig, Fleet, ActorOptions):
+    """Play rallies with the newest policy and send the rollouts to the learner.
+
+    [task], [network] and [experience] must be the learner's, otherwise the actor refuses its policies.
+    """
+
+    often: ClassVar = (
+        *("run", "endpoint", "id", "index", "actors", "envs"),
+        *("task.launch", "task.randomization", "seed", "metrics_port"),
+    )
+
+    index: int = Field(
+        0,
+        ge=0,
+        exclude=True,
+        description="number of this actor, from 0; decides its action noise and its rally shard",
+    )
+    task: TaskConfig = TaskConfig()
+    network: NetworkConfig = NetworkConfig()
+    experience: ExperienceConfig = ExperienceConfig()
+
+    @property
+    def env_count(self) -> int:
+        """How many environments this actor plays."""
+        return self.envs or max(FEWEST_ENVS, ENVS // self.actors)

@@ -1,8 +1,8 @@
 """The sending of rollouts as a value: numbered, retried under the same number, one final verdict each.
 
-Pure: the clock is passed in, and whoever owns the network does what `due` says and tells how it went. A
-rollout is *published* when it gets its number. It stays *in flight* through any number of tries (a lost
-answer, a server that is away or busy) until the learner's final verdict, or until it is *dropped*, given up:
+Pure functions: the clock is passed in. The actor's service sends the rollouts that `due` returns and reports each
+result. A rollout is *published* when it gets its number. It stays *in flight* through any number of tries (a lost
+answer, a server that is away or busy) until the learner's final verdict, or until it is too old and *dropped*:
 
     published = accepted + refused + dropped + in flight          (`Counts.balance` is 0, always)
 """
@@ -42,13 +42,13 @@ class OutboxFullError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """One rollout on its way."""
+    """One rollout in flight."""
 
     sequence: int
     payload: bytes
     born: float  # [s] on the caller's clock
     tries: int = 0
-    next_try: float = 0.0  # [s]; meaningless while a request is under way
+    next_try: float = 0.0  # [s]; not used while a request is pending
     under_way: bool = False
 
 
@@ -70,7 +70,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Outbox:
-    """All rollouts of one incarnation of an actor, and what the learner last said about its wishes."""
+    """All rollouts of one incarnation of an actor, and the learner's newest credits."""
 
     config: OutboxConfig
     next_sequence: int = 0
@@ -78,13 +78,13 @@ class Outbox:
     accepted: int = 0
     refused: tuple[Refusal, ...] = ()
     dropped: tuple[int, ...] = ()
-    generation: int = 0  # of the learner heard last; 0 is none
+    generation: int = 0  # of the learner that answered last; 0: none yet
     credit_limit: int = 0
     credit_version: int = 0
 
     @property
     def counts(self) -> Counts:
-        """The ledger."""
+        """The counts of the ledger."""
         return Counts(
             published=self.next_sequence,
             accepted=self.accepted,
@@ -95,11 +95,11 @@ class Outbox:
 
 
 def idle_reason(outbox: Outbox, generation: int, version: int) -> str:
-    """Return what keeps the actor from starting a rollout with this policy now, or "" if nothing does."""
+    """Return what the actor must wait for before it plays a rollout with this policy, or ""."""
     if len(outbox.flights) >= outbox.config.window:
         return f"the learner's verdict on rollout {outbox.flights[0].sequence}"
     if outbox.generation != generation:
-        return "the learner's first word" if outbox.generation < generation else "the new learner's policy"
+        return "the learner's first answer" if outbox.generation < generation else "the new learner's policy"
     if version < outbox.credit_version:
         return f"policy version {outbox.credit_version}"
     if outbox.next_sequence >= outbox.credit_limit:
@@ -116,7 +116,7 @@ def offer(outbox: Outbox, payload: bytes, now: float) -> Outbox:
 
 
 def due(outbox: Outbox, now: float) -> tuple[Flight, ...]:
-    """Return what is to be sent now, oldest first."""
+    """Return the rollouts to send now, oldest first."""
     return tuple(flight for flight in outbox.flights if not flight.under_way and now >= flight.next_try)
 
 
@@ -126,21 +126,21 @@ def sent(outbox: Outbox, sequence: int) -> Outbox:
 
 
 def at_once(outbox: Outbox, now: float) -> Outbox:
-    """Return the outbox with everything due now that waited to be sent again."""
+    """Return the outbox with all waiting retries due now."""
     return replace(outbox, flights=tuple(replace(flight, next_try=now) for flight in outbox.flights))
 
 
 def unanswered(outbox: Outbox, sequence: int, now: float) -> Outbox:
-    """Return the outbox after a request ended without an answer: the same number goes out again later."""
+    """Return the outbox after a request ended without an answer: the same number is sent again later."""
     return _changed(outbox, sequence, lambda flight: _backed_off(flight, outbox.config, now))
 
 
 def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Outbox:
-    """Return the outbox after a verdict. One on a rollout that is no longer in flight only brings credits."""
+    """Return the outbox after a verdict; if its rollout is no longer in flight, only the credits change."""
     outbox = credited(outbox, verdict)
     if sequence not in (flight.sequence for flight in outbox.flights):
         return outbox
-    # a duplicate's verdict of record stands in ``first``: the answer to an earlier try was lost
+    # a duplicate's recorded verdict is in ``first``: the answer to an earlier try was lost
     if verdict.first not in FINAL_VERDICTS:
         return unanswered(outbox, sequence, now)
     rest = tuple(flight for flight in outbox.flights if flight.sequence != sequence)
@@ -151,7 +151,7 @@ def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Out
 
 
 def credited(outbox: Outbox, verdict: Verdict) -> Outbox:
-    """Return the outbox with the credits that came with any verdict; those of a dead learner are ignored."""
+    """Return the outbox with the credits that came with any verdict; those of an earlier learner are ignored."""
     if verdict.generation < outbox.generation:
         return outbox
     if verdict.generation > outbox.generation:
@@ -163,14 +163,14 @@ def credited(outbox: Outbox, verdict: Verdict) -> Outbox:
 
 
 def expired(outbox: Outbox, now: float) -> Outbox:
-    """Return the outbox without what is too old to go on trying; a request under way is waited for."""
-    given_up = [
+    """Return the outbox without rollouts that are too old; one with a pending request stays."""
+    too_old = [
         flight.sequence
         for flight in outbox.flights
         if not flight.under_way and flight.tries > 0 and now - flight.born >= outbox.config.give_up_s
     ]
-    rest = tuple(flight for flight in outbox.flights if flight.sequence not in given_up)
-    return replace(outbox, flights=rest, dropped=(*outbox.dropped, *given_up))
+    rest = tuple(flight for flight in outbox.flights if flight.sequence not in too_old)
+    return replace(outbox, flights=rest, dropped=(*outbox.dropped, *too_old))
 
 
 def report(
@@ -197,6 +197,6 @@ def _changed(outbox: Outbox, sequence: int, change: Callable[[Flight], Flight]) 
 
 
 def _backed_off(flight: Flight, config: OutboxConfig, now: float) -> Flight:
-    doublings = min(flight.tries - 1, 32)  # far beyond any retry_max_s, and no overflow
+    doublings = min(flight.tries - 1, 32)  # far beyond any retry_max_s, without overflow
     pause_s = min(config.retry_first_s * 2.0**doublings, config.retry_max_s)
     return replace(flight, under_way=False, next_try=now + pause_s)

@@ -1,4 +1,4 @@
-"""Playing the latest policy: one call makes one [T, B] block of experience. No clock, no network."""
+"""Playing the latest policy: one call returns one [T, B] block of experience. No messages are sent here."""
 
 import time
 from collections.abc import Callable
@@ -9,16 +9,19 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import Episodes, PolicySnapshot, Rollout
-from common.env.rally_env import EnvConfig, FinishedRallies, RallyEnv, RallySource
-from common.env.review import Lessons
+from common.env.hit_corrections import HitCorrections
+from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
 from common.env.teacher import teacher_of
 from common.policy.actor_critic import NetworkConfig, log_prob
+from common.policy.contract import training_hash
 from common.policy.normalizer import Moments, normalize
-from common.policy.weights import install, new_network, task_hash
-from common.rally.draws import Stream, bits
-from common.rally.observation import ACTION_SIZE, critic_layout, size
-from common.rally.reward import TERMS
-from common.rally.trajectory import Outcome
+from common.policy.weights import install, new_network
+from common.task.config import TaskConfig
+from common.task.counter_rng import Stream, bits
+from common.task.experience import ExperienceConfig
+from common.task.observation import ACTION_SIZE, critic_layout, size
+from common.task.reward import TERMS
+from common.task.states import Outcome
 
 Floats = npt.NDArray[np.float32]
 
@@ -27,34 +30,35 @@ class Player:
     """B environments and a copy of the policy.
 
     Args:
-        config: The task.
-        network: Network's shape, as the learner's.
-        source: Where rallies come from.
+        task: The task.
+        experience: How training plays it.
+        network: The network's shape, as the learner's.
+        source: Gives the rallies.
         envs: B.
         horizon: T, control steps of one block.
         seed: Of the action noise; differs from actor to actor.
-        launch: Preset of the rallies, part of what learner and actors agree on.
-        clock: Seconds, for the time spent by phase.
+        clock: Returns seconds; measures the duration of each phase.
     """
 
     def __init__(
         self,
-        config: EnvConfig,
+        task: TaskConfig,
+        experience: ExperienceConfig,
         network: NetworkConfig,
         source: RallySource,
         envs: int,
         horizon: int,
         seed: int,
-        launch: str = "paper",
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        torch.set_num_threads(1)  # a second thread makes small matrices slower, and takes the learner's core
-        self._teacher = teacher_of(config)
-        self.env = RallyEnv(envs, config, source, onlooker=self._teacher.sees if self._teacher else None)
-        self.contract_hash = task_hash(network, config.model_dump(mode="json"), launch)
+        torch.set_num_threads(1)  # a second thread makes small products slower and uses the learner's core
+        self._teacher = teacher_of(task, experience.teacher)
+        extra = self._teacher.observation if self._teacher else None
+        self.env = RallyEnv(envs, task, source, experience=experience, extra_observation=extra)
+        self.training_hash = training_hash(task, network, experience)
         self.snapshot: PolicySnapshot | None = None
-        self._obs_size = size(critic_layout(config.observation))
-        self._network = new_network(network, config.observation)  # of which the policy alone is asked
+        self._obs_size = size(critic_layout(task.observation))
+        self._network = new_network(network, task.observation)  # only its policy is used
         self._moments = Moments.initial(self._network.obs_size)
         self._noise = torch.Generator()
         self._seed = seed
@@ -63,16 +67,16 @@ class Player:
         self._shape = (horizon, envs)
 
     def adopt(self, snapshot: PolicySnapshot) -> None:
-        """Play by ``snapshot`` from the next block on; raises PolicyError if it is of another layout."""
-        layout = critic_layout(self.env.config.observation)
-        moments = install(self._network, snapshot, layout, self.contract_hash, "actor")
+        """Play ``snapshot`` from the next block on. Raises PolicyError if it does not fit."""
+        layout = critic_layout(self.env.task.observation)
+        moments = install(self._network, snapshot, layout, self.training_hash, "actor")
         self._moments = moments.first(self._network.obs_size)
         if self.snapshot is None or self.snapshot.stage != snapshot.stage:
             self.env.set_stage(snapshot.stage)
         self.snapshot = snapshot
 
     def play(self, actor: str, incarnation: int, sequence: int) -> Rollout:
-        """Return the next block, numbered and stamped; environments go on where the last block left them.
+        """Return the next block, numbered and stamped. Environments continue where the last block ended.
 
         The action noise is a function of seed and sequence alone, so that a run can be repeated.
         """
@@ -91,18 +95,18 @@ class Player:
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
-        teacher = self._teacher if self.env.config.teacher.teaches(snapshot.version) else None
+        teacher = self._teacher if self.env.experience.teacher.teaches(snapshot.version) else None
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
-        seen = self._network.obs_size
+        width = self._network.obs_size
         for t in range(steps):
             started = self._clock()
             obs[t] = self._obs
             with torch.inference_mode():
-                mean = self._network.act(torch.from_numpy(normalize(self._obs[:, :seen], self._moments)))
+                mean = self._network.act(torch.from_numpy(normalize(self._obs[:, :width], self._moments)))
                 noise = torch.randn(mean.shape, generator=self._noise)
-                action = mean + self._network.log_sigma.exp() * noise
-                log_mu[t] = log_prob(action, mean, self._network.log_sigma).numpy()
+                action = mean + self._network.log_std.exp() * noise
+                log_mu[t] = log_prob(action, mean, self._network.log_std).numpy()
             actions[t] = action.numpy()
             acted = self._clock()
             if teacher:
@@ -112,7 +116,7 @@ class Player:
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated
             terms += step.terms.sum(axis=0)
             if not teacher:
-                correct(corrections, t, step.lessons)
+                correct(corrections, t, step.hit_corrections)
             cut = step.truncated[step.ended]
             if cut.any():
                 final_obs.append(step.final_obs[cut])
@@ -128,7 +132,7 @@ class Player:
             actor=actor,
             incarnation=incarnation,
             sequence=sequence,
-            contract_hash=self.contract_hash,
+            training_hash=self.training_hash,
             obs=obs,
             actions=actions,
             log_mu=log_mu,
@@ -140,22 +144,22 @@ class Player:
             last_obs=self._obs.copy(),
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
-            # An action that was clipped is no basis for what a hit says; what a teacher says has none
+            # No hit correction of a clipped action: its effect differs. A teacher's correction does not depend on it.
             corrections=np.where((np.abs(actions) < 1.0) | bool(teacher), corrections, 0.0),
             seconds=MappingProxyType({"inference": inference, "simulation": simulation}),
         )
 
 
-def correct(corrections: Floats, t: int, lessons: Lessons) -> None:
-    """Write what hits of step ``t`` say of the block's last actions into ``corrections`` (T, B, 7).
+def correct(corrections: Floats, t: int, hits: HitCorrections) -> None:
+    """Write the corrections of the hits in step ``t`` into ``corrections`` (T, B, 7).
 
-    What reaches back beyond the block's beginning is lost: those frames are on their way.
+    Corrections of frames before the block's start are lost, since those frames have been sent.
     """
-    for back in range(min(t + 1, lessons.corrections.shape[1])):
-        reached = lessons.steps > back
+    for back in range(min(t + 1, hits.corrections.shape[1])):
+        reached = hits.steps > back
         if not reached.any():
             return
-        corrections[t - back, lessons.rows[reached]] = lessons.corrections[reached, back]
+        corrections[t - back, hits.rows[reached]] = hits.corrections[reached, back]
 
 
 def _episodes(finished: list[FinishedRallies]) -> Episodes:

@@ -1,4 +1,4 @@
-"""The actor's stock of valid rallies: a ring, first in first out, each consumed once."""
+"""The actor's stock of valid rallies: a first-in first-out ring; each rally is used once."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,9 +9,10 @@ import numpy as np
 
 from common.comms.messages import RallyBatch
 from common.env.rally_env import Launches
-from common.rally.launch import DRAG_FACTOR, LIFT_FACTOR, POSITION, SPIN, VELOCITY, Purpose, draw_rallies
+from common.task.config import TaskConfig
+from common.task.launch import DRAG_FACTOR, LIFT_FACTOR, POSITION, SPIN, VELOCITY, Purpose, draw_rallies
 
-# Far beyond every preset: a ball from elsewhere than a generator must not blow the simulation up.
+# Far beyond every preset: a ball outside these limits could break the simulation.
 LIMITS: Final = (
     ("position", POSITION, -5.0, 5.0),  # m
     ("velocity", VELOCITY, -60.0, 60.0),  # m/s
@@ -21,46 +22,45 @@ LIMITS: Final = (
 
 
 def launch_fault(batch: RallyBatch) -> str:
-    """Return what about a batch can't be a launch, or ""."""
+    """Return why a batch's rows can't be launches, or ""."""
     for name, columns, low, high in LIMITS:
         values = batch.rallies[:, columns]
-        wild = values[(values < low) | (values > high)]
-        if wild.size:
-            return f"{name} {wild[0]:g}; allowed: {low:g} to {high:g}"
+        outside = values[(values < low) | (values > high)]
+        if outside.size:
+            return f"{name} {outside[0]:g}; allowed: {low:g} to {high:g}"
     return ""
 
 
 @dataclass(slots=True)
 class BufferCounts:
-    """What went through a buffer."""
+    """Counts of a buffer."""
 
     received: int = 0  # rallies that arrived in batches
-    consumed: int = 0  # rallies dealt to environments
+    consumed: int = 0  # rallies given to environments
     overflowed: int = 0  # rallies pushed out of the full ring, oldest first
-    underruns: int = 0  # launches that had to be drawn at random
-    gaps: int = 0  # batches that a generator numbered and that never came
-    repeated: int = 0  # batches that came again, and were not taken
+    underruns: int = 0  # launches drawn at random because the ring was empty
+    gaps: int = 0  # batches that a generator numbered and that did not arrive
+    repeated: int = 0  # batches that arrived again, and were ignored
 
 
 class RallyBuffer:
-    """Rallies in the order they came; when empty, random launches, counted and flagged as unvalidated.
+    """Rallies in the order of arrival; when empty, random launches, counted and flagged as unvalidated.
 
     Args:
-        capacity: Rallies wanted in stock: as many as the actor has environments. The batch that fills the ring
-            is held whole, so that batches of any size lose nothing.
-        preset: Launch preset of the fallback.
-        noise: Noise profile of the fallback.
+        capacity: Target number of rallies in stock: the number of the actor's environments. The batch that fills the
+            ring is kept whole, so that batches of any size lose nothing.
+        task: Launch preset, randomization and flight of the fallback.
         seed: Of the fallback launches.
-        refill: Called when the ring runs low, to take in what has arrived; may do nothing.
+        refill: Called when the ring has too few rallies, to add batches that have arrived; may do nothing.
     """
 
     def __init__(
-        self, capacity: int, preset: str, noise: str, seed: int, refill: Callable[[], None] = lambda: None
+        self, capacity: int, task: TaskConfig, seed: int, refill: Callable[[], None] = lambda: None
     ) -> None:
         self.counts = BufferCounts()
         self._ring: deque[tuple[np.ndarray, np.uint64]] = deque()
         self._capacity = capacity
-        self._preset, self._noise, self._seed = preset, noise, seed
+        self._task, self._seed = task, seed
         self._refill = refill
         self._fallback_block = 0
         self._last: dict[tuple[str, int, int], int] = {}
@@ -70,11 +70,11 @@ class RallyBuffer:
 
     @property
     def room(self) -> int:
-        """How many rallies the stock lacks; while it lacks any, one more batch pushes nothing out."""
+        """Number of rallies missing in stock. While it is above 0, one more batch pushes no rally out."""
         return max(0, self._capacity - len(self._ring))
 
     def put(self, batch: RallyBatch) -> None:
-        """Take a batch in; a batch that came before is counted and left."""
+        """Add a batch. A repeated batch is counted and ignored."""
         source = (batch.source, batch.incarnation, batch.shard)
         last = self._last.get(source)
         if last is not None:
@@ -90,31 +90,26 @@ class RallyBuffer:
             self.counts.overflowed += 1
 
     def take(self, count: int) -> Launches:
-        """Return ``count`` launches, oldest first; never blocks."""
+        """Return ``count`` launches, oldest first. Never blocks."""
         while (before := len(self._ring)) < count:
             self._refill()
             if len(self._ring) == before:
                 break
         stocked = [self._ring.popleft() for _ in range(min(count, len(self._ring)))]
-        records = np.empty((count, 11))
+        launches = np.empty((count, 11))
         seeds = np.empty(count, np.uint64)
-        for row, (record, seed) in enumerate(stocked):
-            records[row], seeds[row] = record, seed
+        for row, (launch, seed) in enumerate(stocked):
+            launches[row], seeds[row] = launch, seed
         missing = count - len(stocked)
         if missing:
-            self._draw(records[len(stocked) :], seeds[len(stocked) :])
+            self._draw(launches[len(stocked) :], seeds[len(stocked) :])
             self.counts.underruns += missing
         self.counts.consumed += len(stocked)
-        return Launches(records, seeds, np.arange(count) < len(stocked))
+        return Launches(launches, seeds, np.arange(count) < len(stocked))
 
-    def _draw(self, records: np.ndarray, seeds: np.ndarray) -> None:
+    def _draw(self, launches: np.ndarray, seeds: np.ndarray) -> None:
         block = draw_rallies(
-            len(seeds),
-            seed=self._seed,
-            block=self._fallback_block,
-            preset=self._preset,
-            noise=self._noise,
-            purpose=Purpose.FALLBACK,
+            len(seeds), self._task, seed=self._seed, block=self._fallback_block, purpose=Purpose.FALLBACK
         )
         self._fallback_block += 1
-        records[:], seeds[:] = block.launches, block.seeds
+        launches[:], seeds[:] = block.launches, block.seeds

@@ -1,38 +1,46 @@
 """Settings of the evaluator."""
 
-from typing import Literal
+from typing import ClassVar
 
-from pydantic import Field
+from pydantic import BaseModel, ConfigDict, Field
 
-from common.env.rally_env import EnvConfig
+from common.evaluation.match import DEFAULT_ENVS, Environments
 from common.policy.actor_critic import NetworkConfig
-from common.rally.launch_presets import PresetName
-from common.service_config import ServiceConfig
-from services.evaluator.match import DEFAULT_ENVS, Environments, PolicyExpectation
+from common.service.settings import ServiceConfig
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
 
 
-class EvaluatorConfig(ServiceConfig):
-    """Settings of the evaluator. With --policy: play once, print, end. Without: follow a run and keep its best.
+class EvaluatorOptions(BaseModel):
+    """How the newest policy is evaluated while it trains."""
 
-    Commands with settings of their own, in the place of flags: `play`, `pictures`, `real2sim`, `report RUN...`, `ship`.
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rallies: int = Field(1000, ge=1, le=1_000_000, description="rallies of each evaluation")
+    rounds: int = Field(
+        1, ge=1, le=1000, description="rallies of an episode; it continues while the robot returns the ball"
+    )
+    envs: Environments = DEFAULT_ENVS
+    interval_s: float = Field(
+        45.0, gt=0, description="time between evaluations", json_schema_extra={"unit": "s"}
+    )
+    niceness: int = Field(
+        10, ge=0, le=19, description="niceness of the process, so that learner and actors have priority"
+    )
+
+
+class EvaluatorConfig(ServiceConfig, EvaluatorOptions):
+    """Follow a run: evaluate its newest policy on fixed rallies, and keep the best.
+
+    To measure one policy, use `topspin evaluate`.
     """
 
-    policy: str = Field("", description="policy folder to play once; empty: follow the run")
-    rallies: int = Field(
-        1000, ge=1, le=1_000_000, description="rallies to play; in following, of each evaluation"
+    often: ClassVar = (
+        *("run", "endpoint", "rallies", "interval_s", "envs", "niceness"),
+        *("task.launch", "task.randomization", "seed", "metrics_port"),
     )
-    launch: PresetName = Field("paper", description="launch preset")
-    noise: Literal["off", "standard", "hard"] = Field("standard", description="noise profile")
-    rounds: int = Field(1, ge=1, le=1000, description="rallies an episode plays while they are returned")
-    envs: Environments = DEFAULT_ENVS
-    spin_expected: PolicyExpectation = "contract"
-    json_line: bool = Field(
-        False, alias="json", description="print the measures as one JSON object, last line"
-    )
-    env: EnvConfig = EnvConfig()
+
+    task: TaskConfig = TaskConfig()
     network: NetworkConfig = NetworkConfig()
-    folder: str = Field("", description="run folder; empty: runs/RUN")
-    interval_s: float = Field(
-        45.0, gt=0, description="following: time between evaluations", json_schema_extra={"unit": "s"}
-    )
-    niceness: int = Field(10, ge=0, le=19, description="following: lets learner and actors go first")
+    experience: ExperienceConfig = ExperienceConfig()
+    folder: str = Field("", exclude=True, description="run folder; empty: runs/RUN")

@@ -5,96 +5,36 @@ import logging
 import time
 from collections.abc import Callable
 from threading import Event
-from typing import Any
+from typing import Any, Final
 
-from pydantic import ValidationError
-
-from common.comms.codec import DecodeError, decode, decode_one_of, encode
-from common.comms.keys import Keys
-from common.comms.messages import AVERAGE, Command, Control, ControlReply, PolicySnapshot, Status
+from common.comms.codec import DecodeError, decode
+from common.comms.messages import AVERAGE, PolicySnapshot
 from common.comms.transport import Flow, PendingReply, Reply, Transport
-from common.env.rally_env import EnvConfig
-from common.metrics import Metrics
-from common.policy.weights import (
-    Contract,
-    Policy,
-    PolicyError,
-    contract_of,
-    install,
-    load_policy,
-    new_network,
-    save_policy,
-    task_hash,
-)
-from common.rally.observation import critic_layout
-from common.run_folder import RunFolder
+from common.evaluation.match import evaluation_rallies, play_match
+from common.evaluation.measures import measures
+from common.policy.contract import PolicyError, contract_hash, contract_of
+from common.policy.folder import Policy, load_policy, save_policy
+from common.policy.weights import install, new_network
+from common.service.member import Member
+from common.service.metrics import Metrics
+from common.service.run_folder import RunFolder
+from common.task.observation import critic_layout
+from services.evaluator.best import is_comparable, match_of, score
 from services.evaluator.config import EvaluatorConfig
-from services.evaluator.match import TRAINING_ONLY, evaluation_rallies, play_match
-from services.evaluator.measures import measures
 
 log = logging.getLogger(__name__)
 
-IDLE_WAIT_S = 0.2
-ANSWER_S = 5.0  # for the learner to answer with the policy
-CURVE = (
-    "version",
-    "frames",
-    "stage",
-    "seconds",
-    "catch_rate",
-    "over_rate",
-    "return_rate",
-    "return_after_catch",
-    "target_error_mean",
-    "target_error_median",
-    "rallies",
+IDLE_WAIT_S: Final = 0.2
+ANSWER_S: Final = 5.0  # limit for the learner's answer with the policy
+_RATES: Final = (
+    *("catch_rate", "over_rate", "return_rate", "return_after_catch"),
+    *("target_error_mean", "target_error_median"),
 )
+CURVE: Final = ("version", "frames", "stage", "seconds", *_RATES, "rallies")
 
 
-class _AskedToStop(Exception):  # noqa: N818 - not an error
-    """A stop came within a match."""
-
-
-def score(stage: int, found: dict[str, Any]) -> tuple[int, float]:
-    """Return what "best" compares: a later stage first, then what the stage is for.
-
-    Stages 1 and 2: the catch rate. Stage 3: the return rate less the landing error, a centimetre for a percent: by the
-    return rate alone a policy that aims at the middle of the table would be kept.
-    """
-    if stage < 3:
-        return stage, found["catch_rate"] or 0.0
-    error = found["target_error_mean"]
-    return stage, (found["return_rate"] or 0.0) - (error if error is not None else 1.0)
-
-
-def match_of(config: EvaluatorConfig) -> dict[str, Any]:
-    """Return what is played, as it stands with a policy's measures."""
-    return {
-        "rallies": config.rallies,
-        "launch": config.launch,
-        "noise": config.noise,
-        "rounds": config.rounds,
-    }
-
-
-def _match_in(contract: Contract) -> dict[str, Any]:
-    """Return the match that a contract's measures are of; contracts of earlier releases say it in other places."""
-    rallies = contract.measures.get("rallies")
-    earlier = {"rallies": rallies, "launch": contract.launch, "noise": contract.noise, "rounds": 1}
-    found: dict[str, Any] = contract.measures.get("match", earlier)
-    return found
-
-
-def measured_alike(contract: Contract, config: EvaluatorConfig) -> bool:
-    """Return whether a policy was measured as ``config`` asks for: as many balls of the same kind, in the same task."""
-    irrelevant = {"reward", "noise", "rounds", *TRAINING_ONLY}  # a match has its own, or none
-    try:
-        theirs = EnvConfig.model_validate(contract.env)
-    except ValidationError:
-        return False
-    return _match_in(contract) == match_of(config) and (
-        theirs.model_dump(exclude=irrelevant) == config.env.model_dump(exclude=irrelevant)
-    )
+class _StopRequested(Exception):  # noqa: N818 - not an error
+    """A stop was requested within a match."""
 
 
 class EvaluatorService:
@@ -103,9 +43,9 @@ class EvaluatorService:
     Args:
         config: Settings.
         transport: Connection to the hub.
-        metrics: Where its numbers go.
-        incarnation: Of this life.
-        clock: Seconds.
+        metrics: Receives the service's numbers.
+        incarnation: Number of this life of the service.
+        clock: Returns seconds.
     """
 
     def __init__(
@@ -117,119 +57,117 @@ class EvaluatorService:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
-        self._network = new_network(config.network, config.env.observation)
-        self._contract_hash = task_hash(config.network, config.env.model_dump(mode="json"), config.launch)
-        self._incarnation = incarnation
-        self._keys = keys = Keys(config.run)
-        self._control = transport.serve(keys.ctl("evaluator", config.id), capacity=16)
-        self._alive = transport.declare_alive(keys.alive("evaluator", config.id, incarnation))
+        self._member = Member("evaluator", config, transport, metrics, incarnation)
+        self._network = new_network(config.network, config.task.observation)
+        self._contract_hash = contract_hash(config.task, config.network)
         self._folder = RunFolder.of(config.run, config.folder)
         self._folder.report.mkdir(parents=True, exist_ok=True)
-        self._rallies = evaluation_rallies(
-            config.rallies, config.launch, config.noise, config.seed, config.env.flight
-        )
+        self._task = config.task.model_copy(update={"rounds": config.rounds})
+        self._rallies = evaluation_rallies(config.rallies, self._task, config.seed)
         self._played = (-1, -1)
         self._best = self._best_so_far()
         self._stop = Event()
         self._born = clock()
         self._next_play = self._born
-        self._next_status = 0.0
         self._asked: PendingReply | None = None
         self._last: dict[str, float] = {}
-        self._stopping = False
         self.evaluations = 0
-        self.state = "waiting"
+        self._member.join()
+
+    @property
+    def state(self) -> str:
+        """State in the heartbeat: waiting or playing."""
+        return self._member.state
 
     def run(self, stop: Event) -> None:
-        """Evaluate until ``stop`` is set or a stop is asked for."""
+        """Evaluate until ``stop`` is set or a drain is requested."""
         self._stop = stop
         try:
-            while not stop.is_set() and not self._stopping:
+            while not stop.is_set() and not self._member.is_draining:
                 self.step()
                 self._transport.wait(IDLE_WAIT_S)
-        except _AskedToStop:
-            log.info("stopped within a match, which counts for nothing")
-        self._alive.close()
+        except _StopRequested:
+            log.info("stopped within a match, which is not counted")
+        self._member.leave()
 
     def step(self) -> None:
-        """Ask for the policy if it is time, and evaluate it once it has come."""
-        self._obey()
+        """Request the policy when it is due, and evaluate it when it has arrived."""
+        self._member.answer_control()
         now = self._clock()
         if self._asked is None and now >= self._next_play:
-            # The running mean of the weights, which nobody plays while training: so it isn't broadcast, but asked for.
-            self._asked = self._transport.request(self._keys.policy(), AVERAGE, ANSWER_S, Flow.POLICY)
-        outcome = self._asked.poll() if self._asked else None
-        if outcome is not None:
+            # The running mean of the weights: no actor plays it, so it is requested and not broadcast.
+            self._asked = self._transport.request(self._member.keys.policy(), AVERAGE, ANSWER_S, Flow.POLICY)
+        answer = self._asked.poll() if self._asked else None
+        if answer is not None:
             self._asked = None
             self._next_play = now + IDLE_WAIT_S
-            snapshot = self._read(outcome.payload) if isinstance(outcome, Reply) else None
+            snapshot = self._read(answer.payload) if isinstance(answer, Reply) else None
             if snapshot and (snapshot.generation, snapshot.version) != self._played:
                 self._played = (snapshot.generation, snapshot.version)
-                self.state = "playing"
+                self._member.state = "playing"
                 self._evaluate(snapshot)
                 self._next_play = self._clock() + self._config.interval_s
-                self.state = "waiting"
+                self._member.state = "waiting"
         self._beat()
 
     def _beat(self) -> None:
-        now = self._clock()
-        if now >= self._next_status:
-            self._next_status = now + self._config.status_interval_s
-            self._publish_status()
+        if self._member.is_due(self._clock()):
+            self._member.beat({"evaluations": self.evaluations}, self._last)
 
-    def _breathe(self) -> None:
-        """Stay answerable within a match, which takes longer than anybody would wait."""
-        self._obey()
+    def _on_tick(self) -> None:
+        """Answer requests within a match, which takes longer than a caller waits."""
+        self._member.answer_control()
         self._beat()
-        if self._stop.is_set() or self._stopping:
-            raise _AskedToStop
+        if self._stop.is_set() or self._member.is_draining:
+            raise _StopRequested
 
     def _best_so_far(self) -> tuple[int, float] | None:
-        """Return the score of the best policy that an earlier life kept, if it was measured as we measure."""
+        """Return the score of the best policy of an earlier process, if it was measured in the same match."""
         try:
             contract = load_policy(self._folder.best_policy).contract
-            if not measured_alike(contract, self._config):
+            if not is_comparable(contract, self._config):
                 return None
             return score(contract.stage, dict(contract.measures))
         except (PolicyError, KeyError):
             return None
 
-    def _obey(self) -> None:
-        while (request := self._control.poll()) is not None:
-            try:
-                command = decode_one_of(request.payload, (Control,)).command
-            except DecodeError as error:
-                self._refused("control", error)
-                request.refuse()
-                continue
-            self._stopping |= command in (Command.STOP, Command.DRAIN)
-            request.reply(encode(ControlReply(True, self.state, "")))
-
     def _read(self, payload: bytes) -> PolicySnapshot | None:
         try:
             return decode(payload, PolicySnapshot)
         except DecodeError as error:
-            self._refused("policy", error)
+            self._member.refuse("policy", error)
             return None
 
-    def _refused(self, kind: str, reason: object) -> None:
-        self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
-        log.warning("message refused kind=%s reason=%s", kind, reason)
-
     def _evaluate(self, snapshot: PolicySnapshot) -> None:
-        started = self._clock()
+        config, started = self._config, self._clock()
         try:
-            layout = critic_layout(self._config.env.observation)
+            layout = critic_layout(config.task.observation)
             moments = install(self._network, snapshot, layout, self._contract_hash, "evaluator")
         except PolicyError as error:
-            self._refused("policy", error)
+            self._member.refuse("policy", error)
             return
-        contract = self._contract(snapshot)
+        contract = contract_of(
+            config.task,
+            config.experience,
+            config.network,
+            run=snapshot.run,
+            generation=snapshot.generation,
+            version=snapshot.version,
+            stage=snapshot.stage,
+            frames=snapshot.frames,
+        )
         policy = Policy(self._network, moments, contract)
-        env = self._config.env.model_copy(update={"noise": self._config.noise, "rounds": self._config.rounds})
-        found = measures(play_match(policy, self._rallies, env, self._config.envs, self._breathe))
+        found = measures(play_match(policy, self._rallies, self._task, config.envs, self._on_tick))
         self.evaluations += 1
-        seconds = self._clock() - started
+        self._report(snapshot, found, self._clock() - started)
+        reached = score(snapshot.stage, found)
+        if self._best is None or reached > self._best:
+            self._best = reached
+            measured = contract.model_copy(update={"measures": found | {"match": match_of(config)}})
+            save_policy(self._folder.best_policy, policy.network, policy.moments, measured)
+
+    def _report(self, snapshot: PolicySnapshot, found: dict[str, Any], seconds: float) -> None:
+        """Write an evaluation to log, curve, heartbeat and metrics."""
         log.info(
             "evaluated version=%d frames=%d stage=%d catch=%.3f return=%.3f error=%s seconds=%.1f",
             snapshot.version,
@@ -242,7 +180,7 @@ class EvaluatorService:
         )
         where = {"version": snapshot.version, "frames": snapshot.frames, "stage": snapshot.stage}
         self._append(found | where | {"seconds": round(self._clock() - self._born, 1)})
-        self._last = {name: float(found[name]) for name in CURVE[4:10] if found.get(name) is not None}
+        self._last = {name: float(found[name]) for name in _RATES if found.get(name) is not None}
         self._last |= {"frames": float(snapshot.frames), "stage": float(snapshot.stage)}
         for metric, name in (
             ("topspin_catch_rate", "catch_rate"),
@@ -255,28 +193,6 @@ class EvaluatorService:
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.inc("topspin_phase_seconds_total", seconds, phase="evaluate")
         self._metrics.inc("topspin_episodes_total", found["rallies"])
-        reached = score(snapshot.stage, found)
-        if self._best is None or reached > self._best:
-            self._best = reached
-            save_policy(
-                self._folder.best_policy,
-                policy.network,
-                policy.moments,
-                contract.model_copy(update={"measures": found | {"match": match_of(self._config)}}),
-            )
-
-    def _contract(self, snapshot: PolicySnapshot) -> Contract:
-        config = self._config
-        return contract_of(
-            config.env,
-            config.network,
-            config.launch,
-            run=snapshot.run,
-            generation=snapshot.generation,
-            version=snapshot.version,
-            stage=snapshot.stage,
-            frames=snapshot.frames,
-        )
 
     def _append(self, values: dict[str, Any]) -> None:
         path = self._folder.evaluations
@@ -286,18 +202,3 @@ class EvaluatorService:
             if is_new:
                 writer.writeheader()
             writer.writerow(values)
-
-    def _publish_status(self) -> None:
-        m = self._metrics
-        m.follow("topspin_reconnects_total", self._transport.reconnect_count)
-        m.follow("topspin_messages_dropped_total", self._control.dropped, key="control")
-        status = Status(
-            role="evaluator",
-            id=self._config.id,
-            incarnation=self._incarnation,
-            time=time.time(),
-            state=self.state,
-            counters={"evaluations": float(self.evaluations)},
-            gauges=self._last,
-        )
-        self._transport.publish(self._keys.status("evaluator", self._config.id), encode(status), Flow.STATUS)

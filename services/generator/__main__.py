@@ -3,10 +3,10 @@
 import sys
 from threading import Event
 
-from common.config import load
-from common.connection import connected
-from common.process import DONE, run_service
-from common.service_config import new_incarnation
+from common.service.config import load
+from common.service.connection import connected
+from common.service.process import DONE, run_service
+from common.service.settings import new_incarnation
 from services.generator.config import GeneratorConfig
 from services.generator.service import GeneratorService
 

@@ -1,28 +1,18 @@
 """Settings of a generator."""
 
-from typing import Literal, Self
+from typing import ClassVar, Self
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from common.rally.launch_presets import PresetName
-from common.service_config import ServiceConfig
+from common.service.settings import Fleet, ServiceConfig
+from common.task.config import TaskConfig
 
 
-class GeneratorConfig(ServiceConfig):
-    """Settings of a generator: which rallies, how many, to which shards."""
+class GeneratorOptions(BaseModel):
+    """How fast rallies are published."""
 
-    launch: PresetName = Field("paper", description="launch preset")
-    noise: Literal["off", "standard", "hard"] = Field(
-        "standard", description="how far drag and lift are drawn"
-    )
-    flight: Literal["simple", "full"] = Field("simple", description="aerodynamics; must be the actors'")
-    shards: int = Field(
-        1, ge=1, le=4096, description="shards in all: as many as actors, so that a rally is played once"
-    )
-    index: int = Field(
-        0, ge=0, description="which of the generators this is: 0 up to one less than there are"
-    )
-    of: int = Field(1, ge=1, description="how many generators share the shards")
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
     batch: int = Field(
         128, ge=1, le=1000, description="rallies a message", json_schema_extra={"unit": "rallies"}
     )
@@ -34,8 +24,27 @@ class GeneratorConfig(ServiceConfig):
         json_schema_extra={"unit": "rallies/s"},
     )
 
+
+class GeneratorConfig(ServiceConfig, Fleet, GeneratorOptions):
+    """Publish valid rallies for the actors of a run.
+
+    Launch preset, randomization and flight of [task] decide the rallies. They must be the same as the actors'.
+    """
+
+    often: ClassVar = (
+        *("run", "endpoint", "index", "generators", "actors", "rate_hz"),
+        *("task.launch", "task.randomization", "seed", "metrics_port"),
+    )
+
+    index: int = Field(
+        0, ge=0, exclude=True, description="number of this generator, from 0; decides its shards"
+    )
+    task: TaskConfig = TaskConfig()
+
     @model_validator(mode="after")
     def _is_one_of_the_generators(self) -> Self:
-        if self.index >= self.of:
-            raise ValueError(f"index {self.index}; allowed: 0 to {self.of - 1}, of {self.of} generators")
+        if self.index >= self.generators:
+            raise ValueError(
+                f"index {self.index}; allowed: 0 to {self.generators - 1}, of {self.generators} generators"
+            )
         return self

@@ -1,4 +1,4 @@
-"""How fast a generator publishes, and to which shards: functions of numbers and of the time passed in."""
+"""How fast a generator publishes, and to which shards: the time is passed in."""
 
 
 def shards_of(index: int, of: int, shards: int) -> tuple[int, ...]:
@@ -9,11 +9,11 @@ def shards_of(index: int, of: int, shards: int) -> tuple[int, ...]:
 
 
 class Pace:
-    """Batches at a steady rate, without catching up on what was not wanted while idle.
+    """Batches at a steady rate. Batches that were not needed while idle are not sent later.
 
     Args:
-        rate_hz: Rallies a second.
-        batch: Rallies a batch.
+        rate_hz: Rallies per second.
+        batch: Rallies per batch.
     """
 
     def __init__(self, rate_hz: float, batch: int) -> None:
@@ -21,7 +21,7 @@ class Pace:
         self._next = 0.0
 
     def due(self, now: float) -> bool:
-        """Return whether a batch is due, and reckon it as sent if so."""
+        """Return whether a batch is due, and count it as sent if so."""
         if now < self._next:
             return False
         # A late batch shifts those that follow: a stall must not end in a burst.
@@ -33,5 +33,5 @@ class Pace:
         return max(0.0, self._next - now)
 
     def idle(self, now: float) -> None:
-        """Nobody listens: whoever comes gets the first batch at once."""
+        """Make the next batch due at once, since there is no subscriber now."""
         self._next = now

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from threading import Event
 
 from common.comms.keys import Keys
-from common.config import first_look, load
-from common.connection import connected
-from common.process import DONE, run_service
-from common.run_folder import RunFolder
+from common.service.config import first_look, load
+from common.service.connection import connected
+from common.service.process import DONE, run_service
+from common.service.run_folder import RunFolder
 from services.learner import checkpoint
 from services.learner.config import LearnerConfig
 from services.learner.service import LearnerService
@@ -17,24 +17,23 @@ PROG = "python -m services.learner"
 
 
 def settings(argv: Sequence[str]) -> LearnerConfig:
-    """Return the learner's settings; with --resume those of the run's config.toml, but for what is given now."""
-    asked, _ = first_look(LearnerConfig, ("run", "folder", "resume"), argv, prog=PROG, section="learner")
+    """Return the learner's settings; with --resume those of the run's config.toml, except for flags given now."""
+    asked = first_look(LearnerConfig, ("run", "folder", "resume"), argv, prog=PROG, section="learner")
     file = RunFolder.of(asked.run, asked.folder).config
     if not (asked.resume and file.exists()):
         return load(LearnerConfig, argv, prog=PROG, section="learner")
-    # Which run it is was given now: the file of a copied folder names the folder that it was copied from.
-    which = {"run": asked.run} if not asked.folder else {}
     found = load(LearnerConfig, argv, prog=PROG, section="learner", recorded=file)
-    return found.model_copy(update={"folder": asked.folder, **which})
+    # The flag's name wins: the file in a copied folder has the name of the original run.
+    return found if asked.folder else found.model_copy(update={"run": asked.run})
 
 
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
     config = settings(sys.argv[1:])
-    Keys(config.run)  # refuses a name that can't stand in a key before a folder is made of it
+    Keys(config.run)  # refuses a name that can't be part of a key, before a folder is created
     folder = RunFolder.of(config.run, config.folder)
     if config.resume:
-        checkpoint.newest(folder.checkpoints)  # nothing to resume: nor is a folder made of the name
+        checkpoint.newest(folder.checkpoints)  # raises before a folder is created, if there is no checkpoint
     with (
         folder.held_by("learner"),
         connected("learner", config, stop) as (transport, metrics),

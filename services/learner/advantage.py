@@ -22,9 +22,9 @@ def gae(
     Args:
         rewards: r_t (T, B).
         values: V(s_t) (T, B).
-        terminated: The rules ended the episode at t: V of what follows is 0 (T, B).
-        truncated: The time limit cut it at t: bootstrap from the real last observation (T, B).
-        final_values: V(s') where truncated, anything elsewhere (T, B).
+        terminated: The rules ended the episode at t: the value after it is 0 (T, B).
+        truncated: The time limit ended the episode at t: bootstrap from the real last observation (T, B).
+        final_values: V(s') where truncated, any number elsewhere (T, B).
         last_values: V of the observation after the block (B,).
         gamma: Discount.
         lam: Trace decay.

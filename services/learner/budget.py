@@ -1,21 +1,39 @@
-"""How much a run may train, and when it has: counted through all its restarts."""
+"""How much a run may train, counted through all its restarts."""
 
 import math
 from dataclasses import dataclass
 from typing import Final
 
-ENDING_S: Final = 1.0  # a run that has less left than this has ended: its last dataset came too late
+from pydantic import BaseModel, ConfigDict, Field
+
+ENDING_S: Final = 1.0  # a run with less time left than this has ended: its last dataset arrived too late
 
 NOTHING_LEFT: Final = (
-    "nothing is left to train: %s are trained, through all restarts; give --minutes or --frames more (0: no limit), "
+    "nothing is left to train: %s are trained, through all restarts; raise --minutes or --frames (0: no limit), "
     "or --%scurriculum.stage-3"
 )
-"""The log's line about a run that goes on though its budget is spent: what is, and how the curriculum's flag begins."""
+"""Log line of a resumed run whose budget is spent: the spent limit, and the prefix of the curriculum's flag."""
+
+
+class BudgetConfig(BaseModel):
+    """When a run stops before the end of its curriculum."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    minutes: float = Field(
+        0.0,
+        ge=0,
+        description="stop this long after the first trained batch, counted through restarts; 0: the whole curriculum",
+        json_schema_extra={"unit": "min"},
+    )
+    frames: int = Field(
+        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What ends a run."""
+    """The limits that end a run."""
 
     datasets: int  # of the whole curriculum
     frames: int  # 0: no limit
@@ -25,10 +43,10 @@ class Budget:
         """Return the limit that is reached, such as "10 of 10 minutes", or "".
 
         Args:
-            datasets: Trained.
-            frames: Trained.
+            datasets: Trained so far.
+            frames: Trained so far.
             seconds: Since the first trained batch [s].
-            slack_s: What may be missing of the minutes [s].
+            slack_s: The minutes count as reached this long before their end [s].
         """
         limits = (
             ("datasets", datasets, self.datasets, 0.0),

@@ -17,32 +17,34 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from common.errors import ReportedError
+from common.policy.contract import PolicyError
 from common.policy.normalizer import Moments
-from common.policy.weights import PolicyError, load_state, state_tensors
-from services.learner.guard import Health
-from services.learner.training import Progress, Training
+from common.policy.weights import load_state, state_tensors
+from services.learner.divergence import Health
+from services.learner.epoch_stats import Progress
+from services.learner.training import Training
 
-FORMAT = 1
+FORMAT = 2
 SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
-GOOD = "good"  # folder beside them: the last one that is worth going back to
+GOOD = "good"  # subfolder with the last good checkpoint, for a run that diverges
 
 _NETWORK, _AVERAGE, _ADAM = "network.", "average.", "adam."
 _MOMENTS = ("obs_moments", "value_moments")
 
 
 class CheckpointError(ReportedError, ValueError):
-    """A checkpoint that can't be resumed from: one line that names the file and what is wrong."""
+    """A checkpoint that can't be resumed from: one line with the file and the fault."""
 
 
 @dataclass(frozen=True, slots=True)
 class Extras:
-    """What the service keeps beside the training state."""
+    """What the service keeps with the training state."""
 
     run: str
     generation: int
     stage_log: list[dict[str, Any]]
-    memory: list[dict[str, Any]]  # what became of every rollout: ledger.Remembered
+    accounts: list[dict[str, Any]]  # the fate of every rollout: ledger.AccountSnapshot
     trained_seconds: float  # since the first trained batch, through restarts
 
 
@@ -70,7 +72,7 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
-    for stale in folder.glob("*.part"):  # of a life that ended within a save
+    for stale in folder.glob("*.part"):  # of a process that ended within a save
         stale.unlink(missing_ok=True)
     for old in checkpoints(folder)[:-KEPT]:
         old.unlink(missing_ok=True)
@@ -78,7 +80,7 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
 
 
 def keep(path: Path, folder: Path) -> None:
-    """Let ``folder`` hold the checkpoint ``path`` and no other; the file itself is shared, not copied."""
+    """Make ``path`` the only checkpoint in ``folder``, by a hard link instead of a copy."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / path.name).unlink(missing_ok=True)
     os.link(path, folder / path.name)
@@ -101,7 +103,7 @@ def newest(folder: Path) -> Path:
 
 
 def restore(path: Path, training: Training) -> Extras:
-    """Load a checkpoint into ``training`` and return what the service kept.
+    """Load a checkpoint into ``training`` and return the service's extras.
 
     Raises:
         CheckpointError: The file is missing, damaged, or of another network; ``training`` may be half changed.
@@ -118,14 +120,14 @@ def restore(path: Path, training: Training) -> Extras:
         raise CheckpointError(f"checkpoint {path} has format {about.get('format')!r}; allowed is {FORMAT}")
     try:
         load_state(training.network, _under(_NETWORK, tensors))
-        load_state(training.average, _under(_AVERAGE, tensors) or _under(_NETWORK, tensors))
+        load_state(training.average, _under(_AVERAGE, tensors))
         training.optimizer.load_state_dict(_adam_state(training, _under(_ADAM, tensors)))
         for which in _MOMENTS:
             mean, var, count = (tensors[f"{which}.{part}"] for part in ("mean", "var", "count"))
             setattr(training, which, Moments(mean, var, int(count)))
         training.generator.set_state(torch.from_numpy(np.array(tensors["shuffle"])))
         progress = about["progress"]
-        training.progress = Progress(**progress | {"health": Health(**progress.get("health", {}))})
+        training.progress = Progress(**progress | {"health": Health(**progress["health"])})
         return Extras(**about["extras"])
     except (PolicyError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"checkpoint {path} doesn't fit this configuration: {error}") from None

@@ -1,43 +1,29 @@
 """Settings of the learner."""
 
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
-from common.rally.launch_presets import PresetName
-from common.service_config import ServiceConfig
+from common.service.settings import Fleet, ServiceConfig
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
+from services.learner.budget import BudgetConfig
 from services.learner.curriculum import CurriculumConfig
-from services.learner.guard import GuardConfig
+from services.learner.divergence import DivergenceConfig
 from services.learner.intake import IntakeConfig
 from services.learner.ppo import PPOConfig
 
 
-class LearnerConfig(ServiceConfig):
-    """Settings of the learner; task and network are those its actors must have."""
+class LearnerOptions(BaseModel):
+    """How the learner learns."""
 
-    mode: Literal["hub", "client"] = Field(
-        "hub", description="be the hub that listens at the endpoint, or dial one"
-    )
-    env: EnvConfig = EnvConfig()
-    network: NetworkConfig = NetworkConfig()
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
     ppo: PPOConfig = PPOConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
-    guard: GuardConfig = GuardConfig()
+    divergence: DivergenceConfig = DivergenceConfig()
     intake: IntakeConfig = IntakeConfig()
-    launch: PresetName = Field("paper", description="launch preset, as the generators'")
-    folder: str = Field("", description="run folder; empty: runs/RUN")
-    resume: bool = Field(False, description="go on from the newest checkpoint in the run folder")
-    minutes: float = Field(
-        0.0,
-        ge=0,
-        description="stop this long after the first trained batch, counted through restarts; 0: no limit",
-        json_schema_extra={"unit": "min"},
-    )
-    frames: int = Field(
-        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
-    )
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}
     )
@@ -48,10 +34,33 @@ class LearnerConfig(ServiceConfig):
         json_schema_extra={"unit": "s"},
     )
 
+
+class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
+    """Train a policy on the rollouts of a run's actors.
+
+    The learner is the run's hub: start it first. [task], [network] and [experience] must be those of its actors.
+    """
+
+    often: ClassVar = (
+        *("run", "resume", "actors", "minutes", "frames", "endpoint"),
+        *("task.launch", "ppo.learning_rate", "curriculum.first_stage", "seed"),
+    )
+
+    mode: Literal["hub", "client"] = Field(
+        "hub", exclude=True, description="hub: listen at the endpoint; client: connect to a router there"
+    )
+    task: TaskConfig = TaskConfig()
+    network: NetworkConfig = NetworkConfig()
+    experience: ExperienceConfig = ExperienceConfig()
+    folder: str = Field("", exclude=True, description="run folder; empty: runs/RUN")
+    resume: bool = Field(
+        False, exclude=True, description="go on from the newest checkpoint in the run folder"
+    )
+
     @model_validator(mode="after")
-    def _a_teacher_is_heard(self) -> Self:
-        if self.env.teacher.policy and self.ppo.correction_weight == 0:
+    def _a_teacher_has_weight(self) -> Self:
+        if self.experience.teacher.policy and self.ppo.correction_weight == 0:
             raise ValueError(
-                "ppo.correction_weight 0 beside env.teacher.policy; allowed: above 0, or nobody learns what it says"
+                "ppo.correction_weight 0 with experience.teacher.policy; allowed: above 0 (a teacher needs it)"
             )
         return self

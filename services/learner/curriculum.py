@@ -1,7 +1,8 @@
 """The three-stage curriculum: which stage an epoch belongs to, and the learning rate's bound in it.
 
 Stage 1 pays for catching, stage 2 for hitting forward fast, stage 3 for landing near the target (the paper, section
-III-C). Weights carry over; at a change the observation normaliser's count is reset and another column of R pays.
+III-C). Weights carry over. At a stage change the observation normaliser's count is reset, and the next column of the
+reward matrix R applies.
 """
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -19,17 +20,17 @@ class CurriculumConfig(BaseModel):
     catch_gate: float = Field(
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
     )
-    aiming_log_sigma: float = Field(
+    aiming_log_std: float = Field(
         -2.5,
         ge=-5,
         le=1,
-        description="log of the action noise is at most this as stage 3 begins: a stroke that is to be corrected must "
-        "not drown in it",
+        description="log of the action noise is at most this as stage 3 begins: hit corrections need strokes "
+        "that the noise does not hide",
     )
 
     @property
     def epochs(self) -> int:
-        """Return the whole budget [epochs]."""
+        """Return the epochs of all stages from the first one."""
         return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])
 
 

@@ -1,13 +1,13 @@
-"""Which rollouts wait for an update, what the learner says to each, and how many more it wants.
+"""Which rollouts wait for an update, the verdict on each, and how many more the learner needs.
 
-Pure: no network, no clock of its own, no arrays touched.
+It has state, but no network and no clock of its own, and it reads no array of a rollout.
 
-Lag is counted to where a rollout will be used: everything queued before it, and an update that is running,
-raise the version that it will meet. So what is accepted never turns too old while it waits.
+Lag is counted to the version at use: each dataset queued before a rollout, and a running update, raise it by one. So an
+accepted rollout never becomes too old while it waits.
 
-Pacing: every verdict carries the number below which its actor may publish. The limits add up to what today's
-version is still wanted for, so that actors pause rather than play what would be refused, which would favour
-short episodes. An actor without credits reports until it gets some: no grant can be lost for good.
+Pacing: every verdict carries the number below which its actor may publish. The limits add up to the rollouts that are
+still needed of the present version. So actors pause instead of playing rollouts that would be refused, which would
+favour short episodes. An actor without credits reports until it gets some, so that no grant is lost for good.
 """
 
 from collections import deque
@@ -18,10 +18,10 @@ from typing import Final, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
-from services.learner.ledger import Account, Fate, Ledger, Outcome, Remembered, restored
-from services.learner.verdicts import Case, Header, Standing, judge
+from services.learner.admission import Case, Header, LearnerState, judge
+from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, Outcome, restored
 
-# Of these nothing is written down: the rollout has been judged, or is to come again.
+# These are not recorded: the rollout has a verdict, or its actor sends it again.
 _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
 
 
@@ -30,11 +30,12 @@ class IntakeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    dataset_rollouts: int = Field(
-        1, ge=1, description="rollouts of one dataset; deploy.local: one of each actor, unless it is given"
-    )
+    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
     max_lag: int = Field(
-        2, ge=0, le=64, description="versions that a rollout may be behind; 0 is strictly synchronous"
+        2,
+        ge=0,
+        le=64,
+        description="versions that a rollout may be older than the learner's; 0 is strictly synchronous",
     )
     target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
     queue_rollouts: int = Field(
@@ -61,6 +62,12 @@ class IntakeConfig(BaseModel):
         """Return how many datasets beyond the present one are collected ahead."""
         return min(self.target_lag, self.max_lag)
 
+    def for_actors(self, actors: int) -> Self:
+        """Return the settings with the size of a dataset for so many actors, and a queue of at least two datasets."""
+        rollouts = self.dataset_rollouts or actors
+        queue = self.queue_rollouts if self.dataset_rollouts else max(self.queue_rollouts, 2 * rollouts)
+        return self.model_copy(update={"dataset_rollouts": rollouts, "queue_rollouts": queue})
+
 
 @dataclass(frozen=True, slots=True)
 class Queued:
@@ -71,37 +78,39 @@ class Queued:
 
 
 class Intake:
-    """The learner's side of every rollout's way from its arrival to its update."""
+    """The learner's side of every rollout, from its arrival to its update."""
 
-    def __init__(self, config: IntakeConfig, standing: Standing, memory: Iterable[Remembered] = ()) -> None:
-        self._config = config
-        self._standing = standing
-        self._accounts = {(entry.actor, entry.incarnation): restored(entry) for entry in memory}
+    def __init__(
+        self, config: IntakeConfig, learner: LearnerState, snapshots: Iterable[AccountSnapshot] = ()
+    ) -> None:
+        self._config = config.for_actors(1)  # a size that is not worked out yet is one actor's
+        self._learner_state = learner
+        self._accounts = {(entry.actor, entry.incarnation): restored(entry) for entry in snapshots}
         self._queue: deque[Queued] = deque()
         self._in_update: tuple[Queued, ...] = ()
 
     @property
-    def standing(self) -> Standing:
-        """Where the learner is."""
-        return self._standing
+    def learner(self) -> LearnerState:
+        """What the learner trains now."""
+        return self._learner_state
 
     @property
     def queued(self) -> int:
-        """How many rollouts wait for an update."""
+        """Number of rollouts that wait for an update."""
         return len(self._queue)
 
     def arrive(self, header: Header, rollout: Rollout | None, now: float) -> Verdict:
         """Return the verdict on a rollout, which is queued if it is accepted.
 
         Args:
-            header: What the message says about itself.
+            header: Fields of the message that identify it.
             rollout: Its content; None only if ``header.fault`` says why.
             now: The caller's clock [s].
         """
         known = self._known(header)
         case = Case(
             header=header,
-            standing=self._standing,
+            learner=self._learner_state,
             is_known=known is not None,
             queued=len(self._queue),
             queue_limit=self._queue_limit(),
@@ -109,7 +118,9 @@ class Intake:
             max_lag=self._config.max_lag,
         )
         kind, reason = judge(case)
-        if kind is VerdictKind.WRONG_RUN:  # the namesake of an actor of ours: no account of it here
+        if (
+            kind is VerdictKind.WRONG_RUN
+        ):  # an actor of another run may have the name of one of ours: no account here
             return self._verdict(kind, kind, reason)
         account = self._heard(header.actor, header.incarnation, now)
         if kind is VerdictKind.ACCEPTED:
@@ -126,27 +137,28 @@ class Intake:
         return self._verdict(kind, first, reason, account.credit_limit)
 
     def unreadable(self, reason: str) -> Verdict:
-        """Return the answer to a payload of which nobody can say whose it is: its sender tries again."""
+        """Return the answer to a payload whose sender can't be read: the sender tries again."""
         return self._verdict(VerdictKind.UNREADABLE, VerdictKind.UNREADABLE, reason)
 
     def report(self, report: ActorReport, now: float) -> Verdict:
-        """Return fresh credits for an actor, which is alive if it says so, unless its token has gone since.
+        """Return new credits for an actor, which is alive unless it leaves or its liveliness token is gone.
 
-        News of a death overtakes what the dead said last. Whoever was only cut off is seen again, and then heard.
+        A liveliness loss may arrive before the actor's last report. The token of an actor that was only disconnected
+        appears again, and then its reports count.
         """
         account = self._heard(report.actor, report.incarnation, now)
-        account.hear(report, self._standing.generation)
+        account.hear(report, self._learner_state.generation)
         account.is_alive = not (report.leaving or account.is_out_of_sight)
         self._grant(account, now)
         return self._verdict(VerdictKind.CREDITS, VerdictKind.CREDITS, "", account.credit_limit)
 
     def gone(self, actor: str, incarnation: int) -> None:
-        """Note that an actor died or left: what it had under way is lost, its credits are free."""
+        """Record that an actor died or left: its rollouts in flight are lost, its credits are free."""
         account = self._accounts.setdefault((actor, incarnation), Account(actor, incarnation))
         account.is_alive, account.is_out_of_sight = False, True
 
     def seen(self, actor: str, incarnation: int) -> None:
-        """Note that an actor's token is in sight: one that had gone is back, and what it has under way may come."""
+        """Record that an actor's token is present: after a loss, its rollouts in flight may arrive again."""
         account = self._accounts.get((actor, incarnation))
         if account is not None and account.is_out_of_sight:
             account.is_alive, account.is_out_of_sight = True, False
@@ -164,15 +176,15 @@ class Intake:
         self._in_update = tuple(self._queue.popleft() for _ in range(self._config.dataset_rollouts))
         return self._in_update
 
-    def finish_update(self, standing: Standing) -> None:
-        """Write the dataset down as trained; what waits and can't be used at the new standing is lost."""
+    def finish_update(self, learner: LearnerState) -> None:
+        """Record the dataset as trained; waiting rollouts that the new version can't use are lost."""
         for entry in self._in_update:
             self._settle(entry, Fate.TRAINED)
         self._in_update = ()
-        self._standing = standing
+        self._learner_state = learner
         waiting, self._queue = self._queue, deque()
         for entry in waiting:
-            stays = entry.header.stage_number == standing.stage_number and (
+            stays = entry.header.stage_number == learner.stage_number and (
                 self._version_at_use() - entry.header.version <= self._config.max_lag
             )
             if stays:
@@ -185,12 +197,12 @@ class Intake:
         return {key: account.ledger() for key, account in self._accounts.items()}
 
     def gaps(self) -> int:
-        """Return how many sequence numbers are missing below the highest that came, over all actors."""
+        """Return how many sequence numbers are missing below the highest that arrived, over all actors."""
         return sum(account.gaps for account in self._accounts.values())
 
-    def memory(self) -> tuple[Remembered, ...]:
-        """Return what a checkpoint keeps, so that the next learner tells a retry from news."""
-        return tuple(account.remember() for account in self._accounts.values())
+    def snapshots(self) -> tuple[AccountSnapshot, ...]:
+        """Return what a checkpoint keeps, so that the next learner can tell a retry from a new rollout."""
+        return tuple(account.snapshot() for account in self._accounts.values())
 
     def _settle(self, entry: Queued, fate: Fate) -> None:
         header = entry.header
@@ -204,44 +216,44 @@ class Intake:
     def _queue_limit(self) -> int:
         """Return how many rollouts may wait: no more than this stage will train on.
 
-        One that came after the last dataset of a stage would be accepted only to be lost at the change.
+        A rollout after the last dataset of a stage would be accepted and then lost at the stage change.
         """
-        datasets = self._standing.datasets_left - bool(self._in_update)
+        datasets = self._learner_state.datasets_left - bool(self._in_update)
         return max(0, min(self._config.queue_rollouts, datasets * self._config.dataset_rollouts))
 
     def _version_at_use(self) -> int:
         datasets_before = len(self._queue) // self._config.dataset_rollouts + bool(self._in_update)
-        return self._standing.version + datasets_before
+        return self._learner_state.version + datasets_before
 
     def _known(self, header: Header) -> Outcome | None:
         account = self._accounts.get((header.actor, header.incarnation))
         return None if account is None else account.outcome(header.sequence)
 
     def _verdict(self, kind: VerdictKind, first: VerdictKind, reason: str, credit_limit: int = 0) -> Verdict:
-        standing = self._standing
+        learner = self._learner_state
         return Verdict(
             kind=kind,
             first=first,
             reason=reason,
-            generation=standing.generation,
-            version=standing.version,
-            stage_number=standing.stage_number,
-            stage=standing.stage,
+            generation=learner.generation,
+            version=learner.version,
+            stage_number=learner.stage_number,
+            stage=learner.stage,
             credit_limit=credit_limit,
-            credit_version=standing.version,
+            credit_version=learner.version,
         )
 
     def _grant(self, account: Account, now: float) -> None:
-        """Raise the actor's limit as far as the data is wanted and its window allows."""
+        """Raise the actor's limit as far as data is needed and its window allows."""
         wanted = self._wanted(now)
         room = self._config.window - self._outstanding(account)
         if account.is_alive and min(wanted, room) > 0:
             account.credit_limit = max(account.credit_limit, account.published) + min(wanted, room)
 
     def _wanted(self, now: float) -> int:
-        """Return how many more rollouts of today's version would be used within the lag that is aimed at."""
-        # nothing is collected for after a stage change: it would be lost
-        ahead = min(self._config.lag_aimed_at + 1, self._standing.datasets_left)
+        """Return how many more rollouts of the present version are needed within the target lag."""
+        # nothing is collected for the time after a stage change: it would be lost
+        ahead = min(self._config.lag_aimed_at + 1, self._learner_state.datasets_left)
         datasets = ahead - bool(self._in_update)
         promised = sum(
             self._outstanding(account)
@@ -251,5 +263,5 @@ class Intake:
         return datasets * self._config.dataset_rollouts - len(self._queue) - promised
 
     def _outstanding(self, account: Account) -> int:
-        """Return how many rollouts an actor may still send or has under way."""
+        """Return how many rollouts an actor may still send or has in flight."""
         return max(0, account.credit_limit - account.published) + account.missing

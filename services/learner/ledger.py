@@ -1,11 +1,11 @@
-"""What became of every rollout of every actor: the learner's memory, and the ledger that is counted from it.
+"""The fate of every rollout of every actor, and the ledger that is counted from it.
 
     published = trained + refused(reason) + dropped + in flight + lost        (`Ledger.balance` is 0, always)
 
-Two sides know parts of it. The learner knows the fate of what reached it. Of what did not, or reached only a
-learner that has died since, the actor's report tells: given up (dropped), refused by a dead learner, accepted
-by a dead learner (lost: no update of this one will use it). All of that is final, so a report may be late or
-repeated. What then remains missing is in flight, or lost once the actor is dead.
+Learner and actor each know a part. The learner knows the fate of the rollouts that it received. The actor's report
+has the others: dropped by the actor, refused by an earlier learner, accepted by an earlier learner (lost: no update of
+this one will use it). These fates are final, so a report may be late or repeated. A rollout that is then still missing
+is in flight, or lost once the actor is dead.
 """
 
 from bisect import bisect_right
@@ -20,17 +20,17 @@ from common.comms.messages import ActorReport, VerdictKind
 
 
 class Fate(StrEnum):
-    """What became of a rollout that was not refused."""
+    """The fate of a rollout that was not refused."""
 
     QUEUED = "queued"  # accepted, and an update will use it
     TRAINED = "trained"
-    LOST = "lost"  # accepted, and thrown away untrained
-    DROPPED = "dropped"  # given up by its actor
+    LOST = "lost"  # accepted, and discarded untrained
+    DROPPED = "dropped"  # its actor stopped trying
 
 
 FATES = frozenset(fate.value for fate in Fate)
 
-Outcome = Fate | VerdictKind  # a kind of verdict stands for the refusal
+Outcome = Fate | VerdictKind  # a kind of verdict means a refusal of that kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,21 +66,21 @@ Span = tuple[int, int]  # half-open range of sequence numbers
 
 
 @dataclass(frozen=True, slots=True)
-class Remembered:
+class AccountSnapshot:
     """One incarnation as a checkpoint keeps it."""
 
     actor: str
     incarnation: int
     published: int
-    outcomes: tuple[tuple[str, tuple[Span, ...]], ...]  # which sequence numbers ended how
+    outcomes: tuple[tuple[str, tuple[Span, ...]], ...]  # fates, and the sequence numbers of each
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values that `from_json` reads."""
         return asdict(self)
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "Remembered":
-        """Return what `to_json` gave, after a detour through JSON."""
+    def from_json(cls, values: Mapping[str, Any]) -> "AccountSnapshot":
+        """Return what `to_json` gave, after a round trip through JSON."""
         outcomes = tuple(
             (name, tuple((first, end) for first, end in ranges)) for name, ranges in values["outcomes"]
         )
@@ -90,19 +90,19 @@ class Remembered:
 class Account:
     """What the learner knows about one incarnation of one actor.
 
-    An actor that works for months numbers hundreds of millions, nearly all of which end alike: what became of them is
-    kept as ranges, so that memory hangs on how often outcomes change, not on how many there are nor on how high a
-    number somebody claims.
+    An actor that runs for months numbers hundreds of millions of rollouts, and nearly all have the same outcome. So
+    outcomes are kept as ranges: memory depends on how often the outcome changes, not on the number of rollouts or on
+    the highest number that a message claims.
     """
 
     def __init__(self, actor: str, incarnation: int) -> None:
         self.actor = actor
         self.incarnation = incarnation
-        self.is_alive = True  # nothing that is missing will come from the dead
-        self.is_out_of_sight = False  # its liveliness token went: what it says was said before
+        self.is_alive = True  # a dead actor's missing rollouts will not arrive
+        self.is_out_of_sight = False  # its liveliness token is gone: its reports are older than that
         self.last_heard = 0.0  # [s] on the caller's clock
         self.credit_limit = 0
-        self._known: list[tuple[int, int, Outcome]] = []  # half-open ranges in order, as long as they can be
+        self._known: list[tuple[int, int, Outcome]] = []  # half-open ranges in order, merged where they meet
         self._counts: Counter[Outcome] = Counter()
         self._published = 0
 
@@ -113,31 +113,31 @@ class Account:
 
     @property
     def missing(self) -> int:
-        """How many of them we know nothing else about: under way to us, as long as the actor lives."""
+        """How many of them have no known outcome: in flight as long as the actor lives."""
         return self._published - self._counts.total()
 
     @property
     def gaps(self) -> int:
-        """How many numbers are missing below the highest that came; with a window of 2, one may yet come."""
+        """How many numbers are missing below the highest that arrived; with a window of 2, one may still arrive."""
         return (self._known[-1][1] if self._known else 0) - self._counts.total()
 
     @property
     def ranges(self) -> int:
-        """How many ranges of like outcomes there are: what this account takes of the memory."""
+        """Number of ranges of equal outcomes: the account's memory."""
         return len(self._known)
 
     def outcome(self, sequence: int) -> Outcome | None:
-        """Return what became of a rollout, or None."""
+        """Return the outcome of a rollout, or None."""
         at = self._at(sequence) - 1
         return self._known[at][2] if at >= 0 and sequence < self._known[at][1] else None
 
     def settle(self, sequence: int, outcome: Outcome) -> None:
-        """Write down what became of a rollout; what is final stands."""
+        """Record the outcome of a rollout; a final outcome does not change."""
         if self.outcome(sequence) in (None, Fate.QUEUED):
             self._write(sequence, sequence + 1, outcome)
 
     def hear(self, report: ActorReport, generation: int) -> None:
-        """Take over what the actor knows and the learner of ``generation`` may not."""
+        """Record the outcomes that the actor knows and the learner of ``generation`` may not."""
         self._published = max(self._published, report.published)
         elsewhere: dict[int, Outcome] = {refusal.sequence: refusal.kind for refusal in report.refused}
         elsewhere.update(dict.fromkeys(report.dropped, Fate.DROPPED))
@@ -145,7 +145,7 @@ class Account:
             if sequence < self._published and self.outcome(sequence) is None:
                 self._write(sequence, sequence + 1, outcome)
         if report.generation == generation:
-            # what it doesn't list was accepted, and not by us; before it has heard us, it can't tell yet
+            # Unlisted numbers were accepted by an earlier learner. Before this one answers, the actor can't know that.
             for first, end in self._missing_below(report.published, set(report.in_flight)):
                 self._write(first, end, Fate.LOST)
 
@@ -161,26 +161,26 @@ class Account:
             lost=self._counts[Fate.LOST] + (0 if self.is_alive else self.missing),
         )
 
-    def remember(self) -> Remembered:
+    def snapshot(self) -> AccountSnapshot:
         """Return what a checkpoint keeps."""
         ranges: dict[str, list[Span]] = {}
         for first, end, outcome in self._known:
             ranges.setdefault(outcome.value, []).append((first, end))
         outcomes = tuple((name, tuple(of_one)) for name, of_one in sorted(ranges.items()))
-        return Remembered(self.actor, self.incarnation, self._published, outcomes)
+        return AccountSnapshot(self.actor, self.incarnation, self._published, outcomes)
 
     def _at(self, sequence: int) -> int:
         """Return how many ranges begin at ``sequence`` or before."""
         return bisect_right(self._known, sequence, key=lambda known: known[0])
 
     def _write(self, first: int, end: int, outcome: Outcome) -> None:
-        """Write down the outcome of a range of which nothing is known, or one and the same thing."""
+        """Record the outcome of a range whose numbers have no outcome yet, or all the same one."""
         if (before := self.outcome(first)) is not None:
             self._counts[before] -= end - first
         self._counts[outcome] += end - first
         self._published = max(self._published, end)
         at = self._at(first)
-        near = slice(max(at - 2, 0), at + 1)  # what the new range may cut, or join
+        near = slice(max(at - 2, 0), at + 1)  # ranges that the new one may cut or join
         pieces = [(first, end, outcome)]
         for start, stop, known in self._known[near]:
             pieces += [(start, min(stop, first), known), (max(start, end), stop, known)]
@@ -193,7 +193,7 @@ class Account:
         self._known[near] = joined
 
     def _missing_below(self, end: int, listed: Set[int]) -> list[Span]:
-        """Return the ranges below ``end`` of which nothing is known, without the numbers that are ``listed``."""
+        """Return the ranges below ``end`` without a known outcome, except the numbers that are ``listed``."""
         if not self.missing:
             return []
         taken = sorted([(first, stop) for first, stop, _ in self._known] + [(n, n + 1) for n in listed])
@@ -205,10 +205,10 @@ class Account:
         return found
 
 
-def restored(memory: Remembered) -> Account:
-    """Return the account of a checkpoint; what was queued then died with that learner and is lost."""
+def restored(memory: AccountSnapshot) -> Account:
+    """Return the account of a checkpoint; rollouts that were queued then are lost."""
     account = Account(memory.actor, memory.incarnation)
-    account.is_alive = False  # until it is heard of
+    account.is_alive = False  # until it reports
     in_order = sorted((first, end, name) for name, ranges in memory.outcomes for first, end in ranges)
     for first, end, name in in_order:
         outcome: Outcome = Fate(name) if name in FATES else VerdictKind(name)

@@ -1,7 +1,7 @@
 """Decoupled PPO: the update, as functions of a dataset, a network and an optimiser.
 
 Hilton, Cobbe, Schulman 2022, "Batch size-invariance for policy optimization": data may come from a policy mu that
-is a version or two old, so the trust region is kept around pi_prox (the policy as this update finds it) and the
+is a version or two old, so the trust region is kept around pi_prox (the policy before this update) and the
 importance weight to mu is clipped from above:
 
     r = exp(log pi_theta - log pi_prox),  w = min(exp(log pi_prox - log mu), 2),  detached
@@ -13,7 +13,7 @@ At lag 0 pi_prox = mu, w = 1: plain PPO.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
 from common.policy.normalizer import Moments
-from services.learner.through_arm import Motion, replayed
+from services.learner.bptt import ArmRollout, replayed
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
@@ -52,7 +52,7 @@ class PPOConfig(BaseModel):
         1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage"
     )
     target_kl: float = Field(
-        0.01, gt=0, le=1, description="KL(prox, new) that the learning rate is steered to"
+        0.01, gt=0, le=1, description="KL(prox, new) that the adapted learning rate aims at"
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto",
@@ -62,8 +62,7 @@ class PPOConfig(BaseModel):
     correction_weight: float = Field(
         500.0,
         ge=0,
-        description="weight of the loss that draws the mean towards what the last actions before a hit should have "
-        "been, or a teacher's; 0: PPO alone",
+        description="weight of the loss that pulls the mean towards hit corrections or a teacher; 0: PPO alone",
     )
     refit_epochs: int = Field(
         24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
@@ -73,7 +72,7 @@ class PPOConfig(BaseModel):
     )
 
     @model_validator(mode="after")
-    def _bounds_are_in_order(self) -> Self:  # what the rate starts from is brought within them as it adapts
+    def _bounds_are_in_order(self) -> Self:  # the starting rate is clipped to them when it adapts
         if self.learning_rate_min > self.learning_rate_max:
             raise ValueError(
                 f"learning_rate_min {self.learning_rate_min:g}; "
@@ -91,37 +90,45 @@ class Dataset:
     log_mu: Tensor  # (N,) as recorded by the actor
     log_prox: Tensor  # (N,)
     mean_prox: Tensor  # (N, A)
-    log_sigma_prox: Tensor  # (A,)
+    log_std_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: Tensor  # (N, A) by what mean, or taught, actions should change; rows of zeros: nothing known
-    says: Tensor  # (N, A) weights of what the corrections say
-    motion: Motion | None = None  # of the arms, where gradients go through them
+    corrections: (
+        Tensor  # (N, A) target change of the mean action (or the teacher's); rows of zeros: no correction
+    )
+    correction_weights: Tensor  # (N, A)
+    motion: ArmRollout | None = None  # the arms' motion, if gradients pass through it
 
 
-class Lesson(Enum):
-    """What the policy learns from in an update; the critic learns the rewards in each.
+class UpdateMode(Enum):
+    """What the policy learns from in an update. The critic learns the rewards in each."""
 
-    NOTHING: for the first epochs of a stage, whose rewards the critic doesn't know yet: by the old ones it would punish
-    the very contact that leads on to them. TEACHER: what the corrections say, without a trust region, which is for
-    steps whose worth is guessed from noisy returns (with it, KL held the learning rate to 2e-5).
-    """
+    PPO = auto()
+    # The first epochs of a stage: the critic does not know the stage's rewards yet. With the old values it would punish
+    # the contact that the new rewards need.
+    CRITIC_ONLY = auto()
+    # The teacher's corrections, without a trust region: that is for advantages that are estimated from noisy returns.
+    # With it the KL divergence held the learning rate at 2e-5.
+    DISTILL = auto()
 
-    REWARDS = auto()
-    NOTHING = auto()
-    TEACHER = auto()
+
+class LearningRate(NamedTuple):
+    """The learning rate of one update."""
+
+    start: float  # adapted after every pass
+    highest: float  # upper bound in this epoch
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateStats:
-    """What an update came to."""
+    """The result of an update."""
 
     policy_loss: float
     value_loss: float
     bound_loss: float
     correction_loss: float
     entropy: float
-    kl: float  # KL(prox, new), mean over the last pass: it steers the learning rate
+    kl: float  # KL(prox, new), mean over the last pass: the learning rate adapts to it
     clip_fraction: float
     weight: float  # mean of pi_prox/mu before clipping: 1 at lag 0
     gradient_norm: float  # before clipping
@@ -135,7 +142,7 @@ def arithmetic(precision: str) -> torch.autocast:
     if precision == "auto":
         can = torch.cpu.get_capabilities()
         precision = "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
-    # Without the cache of cast weights: their gradients are then summed over an arm's steps in float32
+    # Without the cache of cast weights, so that gradients over an arm's steps are summed in float32
     enabled = precision == "bfloat16"
     return torch.autocast("cpu", torch.bfloat16, enabled=enabled, cache_enabled=False)
 
@@ -148,25 +155,25 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
 
 
-def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor, says: Tensor) -> Tensor:
+def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor, correction_weights: Tensor) -> Tensor:
     """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
-    The corrected are acted + correction. What a hit says is added to the mean that this update began with: how that
-    should have acted, the noise left out.
+    The corrected action is acted + correction. A hit correction is added to the mean at the start of this update,
+    without the noise.
 
     Args:
         mean: (N, A).
         acted: (N, A).
-        corrections: (N, A); rows of zeros say nothing. A zero in any other says: as it was (of an action that was
-            clipped, of a drive at its limit).
-        says: (N, A) weights.
+        corrections: (N, A); a row of zeros is no correction. A zero in any other row leaves that action as it was (an
+            action that was clipped, a drive at its limit).
+        correction_weights: (N, A).
     """
-    weights = says * (corrections != 0.0).any(-1, keepdim=True)
+    weights = correction_weights * (corrections != 0.0).any(-1, keepdim=True)
     return 0.5 * ((mean - acted - corrections).square() * weights).sum(-1).mean()
 
 
 def minibatches(data: Dataset, size: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Yield one pass over a dataset: which frames (n,), or (T, b) in the order of play where arms are led on."""
+    """Yield one pass over a dataset: frames (n,), or (T, b) in the order of play if gradients pass through the arm."""
     if data.motion is not None:
         yield from data.motion.batches(size, generator)
         return
@@ -190,7 +197,7 @@ def bound_loss(mean: Tensor) -> Tensor:
 
 
 def adapted_learning_rate(rate: float, kl: float, low: float, high: float, target: float) -> float:
-    """Return the learning rate after a look at the KL divergence of the last pass, within [low, high]."""
+    """Return the learning rate adapted to the KL divergence of the last pass, within [low, high]."""
     if kl > 2.0 * target:
         rate /= KL_STEP
     elif kl < 0.5 * target:
@@ -211,89 +218,117 @@ def denormalized(values: Tensor, moments: Moments) -> npt.NDArray[np.float32]:
     return result
 
 
+@dataclass(frozen=True, slots=True)
+class _Losses:
+    """Losses of one minibatch."""
+
+    policy: Tensor
+    value: Tensor
+    bound: Tensor
+    correction: Tensor
+    total: Tensor
+    mean: Tensor  # (n, A)
+    log_new: Tensor  # (n,)
+
+
+def _losses(
+    network: ActorCritic,
+    data: Dataset,
+    config: PPOConfig,
+    batch: Tensor,
+    mode: UpdateMode,
+    is_corrected: bool,
+) -> _Losses:
+    """Return the losses of one minibatch."""
+    with arithmetic(config.precision):
+        mean, values = played(network, data, batch)
+    rows = batch.flatten()
+    log_new = log_prob(data.actions[rows], mean, network.log_std)
+    loss_policy = torch.zeros(())
+    if mode is UpdateMode.PPO:
+        loss_policy = policy_loss(
+            log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
+        )
+    loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
+    loss_bound = bound_loss(mean)
+    loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
+    loss_correction = torch.zeros(())
+    if is_corrected:
+        # A teacher's correction is relative to the played action, a hit's to the mean action
+        acted = (data.actions if mode is UpdateMode.DISTILL else data.mean_prox)[rows]
+        loss_correction = correction_loss(mean, acted, data.corrections[rows], data.correction_weights[rows])
+        loss = loss + config.correction_weight * loss_correction
+    if config.entropy_weight > 0:
+        loss = loss - config.entropy_weight * entropy(network.log_std)
+    return _Losses(loss_policy, loss_value, loss_bound, loss_correction, loss, mean, log_new)
+
+
 def update(
     network: ActorCritic,
     optimizer: torch.optim.Optimizer,
     data: Dataset,
     config: PPOConfig,
-    learning_rate: float,
-    learning_rate_max: float,
+    rate: LearningRate,
     generator: torch.Generator,
     explained: float = 0.0,
-    breathe: Callable[[], None] = lambda: None,
-    lesson: Lesson = Lesson.REWARDS,
+    on_tick: Callable[[], None] = lambda: None,
+    mode: UpdateMode = UpdateMode.PPO,
 ) -> UpdateStats:
-    """Run the mini-epochs of one epoch; ``network`` and ``optimizer`` are changed in place.
+    """Run the mini-epochs of one epoch. ``network`` and ``optimizer`` are changed in place.
 
     Args:
         network: Policy and critic.
         optimizer: Adam over its parameters.
         data: This epoch's dataset.
         config: Hyper-parameters.
-        learning_rate: To begin with; adapted after every pass.
-        learning_rate_max: This epoch's upper bound.
+        rate: Learning rate at the start, and its upper bound.
         generator: Shuffles the minibatches.
-        explained: Explained variance of the values that the dataset was built with, passed through.
-        breathe: Called between gradient steps.
-        lesson: What the policy learns from.
+        explained: Explained variance of the values in the dataset; it is copied to the result.
+        on_tick: Called between gradient steps.
+        mode: What the policy learns from.
     """
     parameters = list(network.parameters())
-    learns = lesson is not Lesson.NOTHING
+    learns = mode is not UpdateMode.CRITIC_ONLY
     for parameter in network.policy_parameters():
-        parameter.requires_grad_(learns)  # a frozen one has no gradient, and Adam leaves it alone
+        parameter.requires_grad_(learns)  # a frozen one has no gradient, so that Adam does not change it
     sums = np.zeros(6)
     is_corrected = config.correction_weight > 0 and learns and bool((data.corrections != 0.0).any())
+    learning_rate = rate.start
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
         for group in optimizer.param_groups:
             group["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
         for batch in minibatches(data, config.minibatch, generator):
-            with arithmetic(config.precision):
-                mean, values = played(network, data, batch)
-            rows = batch.flatten()
-            log_new = log_prob(data.actions[rows], mean, network.log_sigma)
-            loss_policy = torch.zeros(())
-            if lesson is Lesson.REWARDS:
-                loss_policy = policy_loss(
-                    log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
-                )
-            loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
-            loss_bound = bound_loss(mean)
-            loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
-            loss_correction = torch.zeros(())
-            if is_corrected:
-                # A teacher says what he would have done, whatever was; a hit, how to change what led to it
-                acted = (data.actions if lesson is Lesson.TEACHER else data.mean_prox)[rows]
-                loss_correction = correction_loss(mean, acted, data.corrections[rows], data.says[rows])
-                loss = loss + config.correction_weight * loss_correction
-            if config.entropy_weight > 0:
-                loss = loss - config.entropy_weight * entropy(network.log_sigma)
+            losses = _losses(network, data, config, batch, mode, is_corrected)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
+            losses.total.backward()  # type: ignore[no-untyped-call]
             norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
             if not np.isfinite(norm):
                 finite = False
                 continue
             optimizer.step()
+            rows = batch.flatten()
             with torch.no_grad():
-                kl = float(kl_divergence(data.mean_prox[rows], data.log_sigma_prox, mean, network.log_sigma))
-                outside = ((log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
+                kl = float(
+                    kl_divergence(data.mean_prox[rows], data.log_std_prox, losses.mean, network.log_std)
+                )
+                outside = ((losses.log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
             sums += (
-                loss_policy.item(),
-                loss_value.item(),
-                loss_bound.item(),
+                losses.policy.item(),
+                losses.value.item(),
+                losses.bound.item(),
                 outside.float().mean().item(),
                 norm,
-                loss_correction.item(),
+                losses.correction.item(),
             )
-            breathe()
+            on_tick()
             kl_sum += kl
             steps, batches = steps + 1, batches + 1
         kl = kl_sum / max(batches, 1)
-        if lesson is Lesson.REWARDS:
+        if mode is UpdateMode.PPO:
             learning_rate = adapted_learning_rate(
-                learning_rate, kl, config.learning_rate_min, learning_rate_max, config.target_kl
+                learning_rate, kl, config.learning_rate_min, rate.highest, config.target_kl
             )
     means = sums / max(steps, 1)
     return UpdateStats(
@@ -301,7 +336,7 @@ def update(
         value_loss=float(means[1]),
         bound_loss=float(means[2]),
         correction_loss=float(means[5]),
-        entropy=float(entropy(network.log_sigma.detach())),
+        entropy=float(entropy(network.log_std.detach())),
         kl=kl,
         clip_fraction=float(means[3]),
         weight=float((data.log_prox - data.log_mu).exp().mean()),

@@ -2,150 +2,29 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from common.comms.messages import Rollout
-from common.env.rally_env import TeacherConfig
-from common.env.teacher import COMING, NOTE_JOINTS
-from common.policy.actor_critic import ActorCritic, NetworkConfig, log_prob
-from common.policy.normalizer import Moments, normalize
+from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.normalizer import Moments
 from common.policy.weights import new_network
-from common.rally.observation import (
-    OBSERVATION,
-    PAPER_OBSERVATION,
-    ObservationConfig,
-    critic_layout,
-    offsets,
-    size,
-)
-from common.rally.reward import TERMS
-from services.learner.advantage import gae
-from services.learner.arm import Arm
+from common.task.experience import TeacherConfig
+from common.task.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
 from services.learner.curriculum import CurriculumConfig, decayed, learning_rate_bound, next_stage
-from services.learner.guard import GuardConfig, Health, divergence, running_mean, watched
-from services.learner.ppo import (
-    Dataset,
-    Lesson,
-    PPOConfig,
-    UpdateStats,
-    arithmetic,
-    denormalized,
-    explained_variance,
-    update,
-)
-from services.learner.through_arm import Motion
+from services.learner.dataset import Batch, Distillation, Model, read
+from services.learner.differentiable_arm import ArmModel
+from services.learner.divergence import DivergenceConfig, Health, divergence, running_mean, watched
+from services.learner.epoch_stats import EpochStats, Progress
+from services.learner.ppo import LearningRate, PPOConfig, UpdateMode, update
 
 Floats = npt.NDArray[np.float32]
 
-_JOINTS = slice(offsets(OBSERVATION)["joint_pos"].start, offsets(OBSERVATION)["joint_vel"].stop)
-
-NOTE_WEIGHT = 3.0  # besides 1: what is read from a note is a difference of a tenth of what it holds
-AVERAGE_DECAY = 0.99  # of the weights' running mean, a dataset: it looks back over some 0.8 M frames
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Where training stands: everything that decides what comes next but the tensors."""
-
-    version: int = 0  # updates done: the policy's version
-    epoch: int = 0
-    frames: int = 0
-    stage: int = 1
-    stage_number: int = 0  # stage changes so far
-    epochs_in_stage: int = 0
-    learning_rate: float = 5e-4
-    catch_rate: float = float("nan")  # running, with exploration noise
-    refitting: bool = False  # the stage has changed, and the critic learns its rewards first
-    health: Health = field(default_factory=Health)
-    rollbacks: int = 0  # times that training went back to a good checkpoint
-    closing: int = 0  # datasets that the stage still takes once its gate has opened; 0: it hasn't
-    refitting_since: int = 0  # epoch of the stage in which the critic began to
-
-    @property
-    def is_worth_going_back_to(self) -> bool:
-        """Whether a checkpoint of now may be the one to go back to.
-
-        A stage begins with one: until its measure speaks, the last good one is of the stage before.
-        """
-        return self.health.is_good or (self.stage_number > 0 and self.epochs_in_stage == 0)
-
-
-@dataclass(frozen=True, slots=True)
-class PlayStats:
-    """What the rallies of one dataset came to; unvalidated ones are left out of all rates."""
-
-    rallies: int
-    caught: int
-    over: int
-    returned: int
-    error_sum: float  # [m] over returned rallies
-    outcomes: npt.NDArray[np.int64]  # (13,) by trajectory.Outcome
-    unvalidated: int
-    mean_return: float
-    reward_terms: npt.NDArray[np.float64]  # (8,) mean per frame, reward.TERMS
-
-    @property
-    def catch_rate(self) -> float:
-        """Share of the rallies in which the racket met the ball; as all rates nan where no rally ended."""
-        return _share(self.caught, self.rallies)
-
-    @property
-    def over_rate(self) -> float:
-        """Share of the rallies in which the ball went over the net."""
-        return _share(self.over, self.rallies)
-
-    @property
-    def return_rate(self) -> float:
-        """Share of the rallies in which it landed on the opponent's court."""
-        return _share(self.returned, self.rallies)
-
-    @property
-    def target_error(self) -> float:
-        """Mean distance of what landed to the target [m]; nan where nothing did."""
-        return _share(self.error_sum, self.returned)
-
-
-def _share(part: float, whole: int) -> float:
-    return part / whole if whole else float("nan")
-
-
-@dataclass(frozen=True, slots=True)
-class EpochStats:
-    """One epoch, for metrics and logs."""
-
-    progress: Progress  # after it
-    update: UpdateStats
-    play: PlayStats
-    stage_changed: bool
-    diverged: str  # why training has diverged, or nothing
-    lag: float  # mean of (version before the update - version that played)
-    frames: int
-
-
-def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
-    """Return the rates' raw counts over the rallies that ended in ``rollouts``."""
-    outcome = np.concatenate([r.episodes.outcome for r in rollouts])
-    rated = ~np.concatenate([r.episodes.unvalidated for r in rollouts])
-    landed = np.concatenate([r.episodes.landed for r in rollouts]) & rated
-    error = np.concatenate([r.episodes.target_error for r in rollouts])
-    returns = np.concatenate([r.episodes.returns for r in rollouts])
-    frames = sum(r.rewards.size for r in rollouts)
-    terms = np.sum([r.reward_terms.astype(np.float64) for r in rollouts], axis=0) / frames
-    return PlayStats(
-        rallies=int(rated.sum()),
-        caught=int((np.concatenate([r.episodes.caught for r in rollouts]) & rated).sum()),
-        over=int((np.concatenate([r.episodes.over for r in rollouts]) & rated).sum()),
-        returned=int(landed.sum()),
-        error_sum=float(error[landed].sum(dtype=np.float64)),
-        outcomes=np.bincount(outcome[rated], minlength=13)[:13],
-        unvalidated=int((~rated).sum()),
-        mean_return=float(returns[rated].mean()) if rated.any() else float("nan"),
-        reward_terms=terms if terms.size else np.zeros(len(TERMS)),
-    )
+AVERAGE_DECAY: Final = 0.99  # of the weights' running mean, per dataset: it covers about 0.8 M frames
 
 
 class Training:
@@ -156,12 +35,12 @@ class Training:
         network: Network's shape.
         curriculum: Stage lengths.
         home_action: Initial bias of the mean head (7,).
-        seed: Of the network's start and the minibatches' shuffle.
-        notice: Datasets that a stage still takes after its gate has opened: those that are being collected then.
-        observation: What policy and critic see.
-        guard: When training counts as diverged.
-        teacher: Who the policy learns from first.
-        arm: The task's robot, where what the teacher says is learned through it; else nobody asks.
+        seed: Of the network's initial weights and the minibatches' shuffle.
+        notice: Datasets that a stage still takes after its gate has opened: actors already collect them.
+        observation: What policy and critic observe.
+        divergence: When training counts as diverged.
+        teacher: The policy that it learns from first, if any.
+        arm: The task's robot, if gradients pass through it while the policy imitates a teacher; else None.
     """
 
     def __init__(
@@ -173,23 +52,23 @@ class Training:
         seed: int,
         notice: int = 1,
         observation: ObservationConfig = PAPER_OBSERVATION,
-        guard: GuardConfig = GuardConfig(),
+        divergence: DivergenceConfig = DivergenceConfig(),
         teacher: TeacherConfig = TeacherConfig(),
-        arm: Arm | None = None,
+        arm: ArmModel | None = None,
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.network: ActorCritic = new_network(network, observation, home_action)
-        # Every dataset moves the weights by its noise as well as by what it says; their mean plays better (Polyak and
-        # Juditsky 1992; Hilton et al. 2022 average a policy likewise). It is what gets measured and kept.
+        # The noise of every dataset also moves the weights. Their running mean plays better (Polyak and Juditsky 1992;
+        # Hilton et al. 2022 average a policy in the same way). The mean is evaluated and saved.
         self.average: ActorCritic = copy.deepcopy(self.network)
         self.network_config = network
         self.obs_size = size(critic_layout(observation))
         self.ppo = ppo
         self.curriculum = curriculum
         self.notice = notice
-        self.guard = guard
+        self.divergence = divergence
         self.teacher = teacher
         self.arm = arm
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
@@ -200,38 +79,39 @@ class Training:
 
     @property
     def datasets_left(self) -> int:
-        """How many datasets the present stage still takes, the next one included; at least 1.
+        """Number of datasets that the present stage still takes, with the next one; at least 1.
 
-        A gate may end stage 1 earlier: it speaks ``notice`` datasets ahead, so that none is collected in vain.
+        A gate may end stage 1 earlier. It opens ``notice`` datasets ahead, so that no collected dataset is lost.
         """
         config, progress = self.curriculum, self.progress
         if progress.closing:
             return progress.closing
-        if progress.stage == 3:  # the last stage also takes the epochs that a gate has saved
+        if progress.stage == 3:  # the last stage also takes the epochs that a gate saved
             return max(1, config.epochs - progress.epoch)
         return max(1, (config.stage_1, config.stage_2)[progress.stage - 1] - progress.epochs_in_stage)
 
     @property
-    def is_taught(self) -> bool:
-        """Whether the policy as it stands still learns from the teacher."""
+    def is_distilling(self) -> bool:
+        """Whether the policy still learns from the teacher."""
         return self.teacher.teaches(self.progress.version)
 
     @property
     def is_finite(self) -> bool:
-        """Whether every parameter is."""
+        """Whether every parameter is finite."""
         return all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
 
     def run_epoch(
-        self, rollouts: Sequence[Rollout], breathe: Callable[[], None] = lambda: None
+        self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None
     ) -> EpochStats:
         """Train one epoch on ``rollouts`` and go on to the next version; their order decides the result's bits.
 
         Args:
             rollouts: The dataset; blocks may differ in shape.
-            breathe: Called between gradient steps, so that the caller can look after other things.
+            on_tick: Called between gradient steps, so that the caller can do other work.
         """
         before = self.progress
-        data, explained = self._dataset(rollouts)
+        batch = self.read(rollouts, on_tick)
+        self.value_moments = batch.value_moments
         bound = learning_rate_bound(
             before.stage,
             before.epochs_in_stage,
@@ -239,42 +119,45 @@ class Training:
             self.ppo.learning_rate_min,
             self.curriculum,
         )
-        # A value that explains the new rewards is what the policy waits for after a stage change.
+        # After a stage change the policy waits for a critic that explains the new rewards.
         refitted = before.epochs_in_stage - before.refitting_since
         is_refitting = before.refitting and (
-            refitted < self.ppo.refit_epochs and explained < self.ppo.refit_variance
+            refitted < self.ppo.refit_epochs and batch.explained < self.ppo.refit_variance
         )
-        if self.is_taught:
-            self._calm(self.teacher.log_sigma)
-        lesson = Lesson.NOTHING if is_refitting else Lesson.TEACHER if self.is_taught else Lesson.REWARDS
+        if self.is_distilling:
+            self._cap_log_std(self.teacher.max_log_std)
+        mode = (
+            UpdateMode.CRITIC_ONLY
+            if is_refitting
+            else UpdateMode.DISTILL
+            if self.is_distilling
+            else UpdateMode.PPO
+        )
         stats = update(
             self.network,
             self.optimizer,
-            data,
+            batch.data,
             self.ppo,
-            self._rate(lesson, bound),
-            bound,
+            LearningRate(self._rate(mode, bound), bound),
             self.generator,
-            explained,
-            breathe,
-            lesson,
+            batch.explained,
+            on_tick,
+            mode,
         )
         frozen = moments = self.obs_moments
-        for rollout in rollouts:
-            moments = moments.merged(Moments.of(rollout.obs.reshape(-1, self.obs_size)))
-            breathe()
-        # At once, and with the weights below: who is answered meanwhile gets a whole policy.
+        for part in batch.obs_moments:
+            moments = moments.merged(part)
+        # No tick until the weights below have changed too: a request then gets a consistent policy.
         self.obs_moments = moments
         if before.stage_number > 0:
-            # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset: the
-            # network must not play differently for it.
+            # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset. The
+            # network must not play differently because of it.
             for network in (self.network, self.average):
                 network.renormalize(frozen, self.obs_moments)
-        self._follow()
-        play = play_stats(rollouts)
-        frames = sum(r.rewards.size for r in rollouts)
+        self._update_ema()
+        play = batch.play
         running = running_mean(before.catch_rate, play.catch_rate)
-        # Without a look at the gate: when it opens, rollouts of this stage are on their way, and are trained on first.
+        # The gate is left out here: when it opens, rollouts of this stage are in flight, and are trained on first.
         stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
         due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
         closing = before.closing - 1 if before.closing else self.notice if due != stage else 0
@@ -282,14 +165,14 @@ class Training:
             stage = 2 if self.curriculum.stage_2 > 0 else 3
         changed = stage != before.stage
         rate = play.return_rate if before.stage == 3 else play.catch_rate
-        # While the critic alone learns, the policy can't have gone wrong.
-        health = before.health if is_refitting else watched(before.health, rate, self.guard)
+        # While only the critic learns, the policy cannot diverge.
+        health = before.health if is_refitting else watched(before.health, rate, self.divergence)
         if changed:
             self._enter(stage)
         self.progress = Progress(
             version=before.version + 1,
             epoch=before.epoch + 1,
-            frames=before.frames + frames,
+            frames=before.frames + batch.frames,
             stage=stage,
             stage_number=before.stage_number + changed,
             epochs_in_stage=0 if changed else before.epochs_in_stage + 1,
@@ -301,51 +184,55 @@ class Training:
             closing=0 if changed else closing,
             refitting_since=0 if changed else before.refitting_since,
         )
-        lag = float(np.mean([before.version - r.version for r in rollouts]))
-        diverged = divergence(health, self.is_finite, self.guard)
-        return EpochStats(self.progress, stats, play, changed, diverged, lag, frames)
+        diverged = divergence(health, self.is_finite, self.divergence)
+        return EpochStats(self.progress, stats, play, changed, diverged, batch.lag, batch.frames)
 
-    def _rate(self, lesson: Lesson, bound: float) -> float:
-        """Return the learning rate that an update begins with."""
+    def read(self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None) -> Batch:
+        """Return the data of the next epoch from its rollouts; nothing is changed."""
+        model = Model(self.network, self.obs_moments, self.value_moments, self.obs_size, self.ppo)
+        distillation = Distillation(self.teacher, self.is_distilling, self.arm)
+        return read(rollouts, model, distillation, self.progress.version, on_tick)
+
+    def _rate(self, mode: UpdateMode, bound: float) -> float:
+        """Return the learning rate at the start of an update."""
         ppo = self.ppo
-        if lesson is Lesson.TEACHER:
-            gone = self.progress.version / self.teacher.epochs
-            return decayed(gone, ppo.learning_rate, ppo.learning_rate_min)
-        return bound if lesson is Lesson.NOTHING else min(self.progress.learning_rate, bound)
+        if mode is UpdateMode.DISTILL:
+            share = self.progress.version / self.teacher.epochs
+            return decayed(share, ppo.learning_rate, ppo.learning_rate_min)
+        return bound if mode is UpdateMode.CRITIC_ONLY else min(self.progress.learning_rate, bound)
 
     @torch.no_grad()
-    def _follow(self) -> None:
-        """Let the running mean of the weights take in the newest; a young mean forgets its start faster."""
+    def _update_ema(self) -> None:
+        """Update the running mean of the weights. A new mean forgets its start faster."""
         weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
         for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(newest, weight)
 
     def _enter(self, stage: int) -> None:
-        """Make a stage change's changes to what has been learned."""
+        """Reset the normaliser's count and cap the action noise, for a new stage."""
         self.obs_moments = self.obs_moments.recounted()
         if stage == 3:
-            self._calm(self.curriculum.aiming_log_sigma)
+            self._cap_log_std(self.curriculum.aiming_log_std)
 
     @torch.no_grad()
-    def _calm(self, log_sigma: float) -> None:
-        """Let the action noise be no larger than this from now on."""
+    def _cap_log_std(self, log_std: float) -> None:
+        """Bound the log standard deviation of actions from above."""
         for network in (self.network, self.average):
-            network.log_sigma.clamp_(max=log_sigma)
+            network.log_std.clamp_(max=log_std)
 
     def forget_health(self) -> None:
-        """Judge the stage's rate anew from now on."""
+        """Start the stage's measure again."""
         self.progress = replace(self.progress, health=Health())
 
     def go_back(self, load: Callable[["Training"], object]) -> None:
-        """Take network, optimiser and moments from an earlier moment of this run; time doesn't go back.
+        """Take network, optimiser and moments from an earlier checkpoint of this run. Counts do not go back.
 
-        Versions, frames, epochs and the stage go on, since actors hold this life's policies; where the earlier moment
-        was of another stage, the change is made again, and a critic that knew other rewards than the stage's learns
-        them first. The learning rate starts anew at half of what led here: the same steps on other data might lead
-        here again.
+        Versions, frames, epochs and the stage go on, since actors have this process's policies. If the checkpoint is
+        of another stage, the stage change is made again, and the critic learns the new rewards first. The learning rate
+        starts at half of its value now, since the same steps on other data might diverge again.
 
         Args:
-            load: Restores the earlier moment into the training it is given.
+            load: Restores the checkpoint into the training it is given.
         """
         now = self.progress
         load(self)
@@ -360,97 +247,3 @@ class Training:
             refitting=is_other_stage or then.refitting,
             refitting_since=now.epochs_in_stage,
         )
-
-    def _dataset(self, rollouts: Sequence[Rollout]) -> tuple[Dataset, float]:
-        """Return the update's data: normalised by the newest frozen copy, pi_prox and the critic computed afresh."""
-        ppo, log_sigma = self.ppo, self.network.log_sigma.detach().clone()
-        parts: list[tuple[torch.Tensor, ...]] = []
-        advantages, returns, values_all = [], [], []
-        with torch.no_grad():
-            for r in rollouts:
-                steps, count = r.rewards.shape
-                obs = torch.from_numpy(normalize(r.obs, self.obs_moments).reshape(-1, self.obs_size))
-                actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
-                with arithmetic(ppo.precision):
-                    mean, value = self.network(obs)
-                mean, value = mean.float(), value.float()
-                values = denormalized(value, self.value_moments).reshape(steps, count)
-                final = np.zeros(steps * count, np.float32)
-                final[r.final_index] = self._values(r.final_obs)
-                advantage = gae(
-                    r.rewards * np.float32(ppo.reward_scale),
-                    values,
-                    r.terminated,
-                    r.truncated,
-                    final.reshape(steps, count),
-                    self._values(r.last_obs),
-                    ppo.gamma,
-                    ppo.gae_lambda,
-                )
-                # The last of a teacher's words come when rewards are learned from: they aren't corrections of hits
-                is_late = self.teacher.teaches(r.version) and not self.is_taught
-                said = np.zeros_like(r.corrections) if is_late else r.corrections
-                parts.append(
-                    (
-                        obs,
-                        actions,
-                        torch.tensor(r.log_mu.reshape(-1)),
-                        log_prob(actions, mean, log_sigma),
-                        mean,
-                        torch.tensor(said.reshape(-1, said.shape[-1])),
-                        torch.from_numpy(self._weights(r)).reshape(-1, r.actions.shape[-1]),
-                    )
-                )
-                advantages.append(advantage.reshape(-1))
-                returns.append((advantage + values).reshape(-1))
-                values_all.append(values.reshape(-1))
-        target = np.concatenate(returns)
-        explained = explained_variance(target, np.concatenate(values_all))
-        self.value_moments = self.value_moments.merged(Moments.of(target))
-        scale = np.sqrt(self.value_moments.var + 1e-5)
-        advantage = np.concatenate(advantages)
-        advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        obs, actions, log_mu, log_prox, mean, corrections, says = (
-            torch.cat(part) for part in zip(*parts, strict=True)
-        )
-        targets = ((target - self.value_moments.mean) / scale).astype(np.float32)
-        data = Dataset(
-            obs,
-            actions,
-            log_mu,
-            log_prox,
-            mean,
-            log_sigma,
-            torch.from_numpy(advantage),
-            torch.from_numpy(targets),
-            corrections,
-            says,
-            self._motion(rollouts, actions),
-        )
-        return data, explained
-
-    def _motion(self, rollouts: Sequence[Rollout], actions: torch.Tensor) -> Motion | None:
-        """Return what the arms did under a dataset's actions (N, A), where what is said is learned through them."""
-        if self.arm is None or not self.is_taught:
-            return None
-        frames = torch.split(torch.arange(len(actions)), [r.rewards.size for r in rollouts])
-        rows = tuple(some.reshape(r.rewards.shape) for some, r in zip(frames, rollouts, strict=True))
-        joints = np.concatenate([r.obs.reshape(-1, self.obs_size)[:, _JOINTS] for r in rollouts])
-        ended = np.concatenate([(r.terminated | r.truncated).reshape(-1) for r in rollouts])
-        return Motion.of(
-            self.arm, rows, torch.from_numpy(joints), actions, torch.from_numpy(ended), self.obs_moments
-        )
-
-    def _weights(self, rollout: Rollout) -> Floats:
-        """Return how much what is said of each action weighs (T, B, A): more where notes are written and held."""
-        weights = np.ones_like(rollout.actions)
-        if self.is_taught and self.teacher.notes:
-            weights[..., NOTE_JOINTS] += NOTE_WEIGHT * rollout.obs[..., COMING, None]
-        return weights
-
-    def _values(self, obs: Floats) -> Floats:
-        if len(obs) == 0:
-            return np.zeros(0, np.float32)
-        with arithmetic(self.ppo.precision):
-            _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
-        return denormalized(value.float(), self.value_moments)

@@ -1,4 +1,4 @@
-"""What Gymnasium asks of an environment, of the single one and of the batch."""
+"""Gymnasium's requirements on an environment, for the single one and the batch."""
 
 import warnings
 
@@ -9,11 +9,11 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import vector
 
-from common.env.gym import ENV_ID
-from common.env.rally_env import EnvConfig
-from common.rally.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
-from common.rally.trajectory import Outcome
+from common.task.config import TaskConfig
+from common.task.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
+from common.task.states import Outcome
 from tests.unit.env.rallies import make_env
+from topspin.gym_ids import ENV_ID
 
 
 def make(**settings) -> gymnasium.Env:
@@ -37,26 +37,26 @@ def play(env: gymnasium.Env, steps: int, seed: int = 0) -> list[np.ndarray]:
     return seen
 
 
-def test_gymnasiums_own_checker_finds_nothing_to_warn_of():
+def test_gymnasiums_checker_gives_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(make().unwrapped)
 
 
-def test_random_play_through_all_wrappers_warns_of_nothing():
+def test_random_play_through_all_wrappers_gives_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         play(make(), 100)
 
 
-@pytest.mark.parametrize("noise", ["off", "standard", "hard"])
-def test_every_observation_lies_in_the_space(noise):
-    env = make(noise=noise)
+@pytest.mark.parametrize("randomization", ["off", "standard", "hard"])
+def test_every_observation_lies_in_the_space(randomization):
+    env = make(randomization=randomization)
 
     assert all(env.observation_space.contains(obs) for obs in play(env, 200))
 
 
-def test_with_camera_and_estimator_every_observation_lies_in_the_space_too():
+def test_with_camera_and_filter_every_observation_lies_in_the_space_too():
     env = make(perception="full")
 
     assert all(env.observation_space.contains(obs) for obs in play(env, 200))
@@ -71,14 +71,14 @@ def test_the_spaces_are_the_layouts():
     np.testing.assert_array_equal(env.action_space.high, [1] * 7)
 
 
-def test_a_seed_decides_all_that_follows():
+def test_a_seed_decides_all_later_rallies():
     one, two, other = play(make(), 150, seed=5), play(make(), 150, seed=5), play(make(), 150, seed=6)
 
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one[0], other[0])
 
 
-def test_resets_without_a_seed_bring_new_rallies():
+def test_resets_without_a_seed_give_new_rallies():
     env = make()
     first, _ = env.reset(seed=1)
     second, _ = env.reset()
@@ -86,12 +86,12 @@ def test_resets_without_a_seed_bring_new_rallies():
     assert not np.array_equal(first, second)
 
 
-def test_an_episodes_last_observation_is_its_own_and_the_reset_brings_the_next():
-    env = make(noise="off")
+def test_an_episodes_last_observation_is_its_own_and_the_reset_gives_the_next():
+    env = make(randomization="off")
     env.reset(seed=1)
     terminated = truncated = False
     while not (terminated or truncated):
-        obs, _, terminated, truncated, info = env.step(env.unwrapped._table.env.home_action)
+        obs, _, terminated, truncated, info = env.step(env.unwrapped._batch.env.home_action)
     ball = env.unwrapped._next_obs[0, 24:27]
 
     assert not np.allclose(obs[24:27], ball)
@@ -99,7 +99,7 @@ def test_an_episodes_last_observation_is_its_own_and_the_reset_brings_the_next()
     np.testing.assert_array_equal(env.reset()[0][24:27], ball)
 
 
-def test_a_step_beyond_an_episodes_end_is_refused():
+def test_a_step_after_an_episodes_end_is_refused():
     env = make(time_limit_s=0.2).unwrapped
     env.reset(seed=1)
     for _ in range(10):
@@ -131,9 +131,9 @@ def test_the_batch_has_the_spaces_of_its_environments():
     assert info == {}
 
 
-def test_the_batch_hands_over_last_observation_and_facts_in_gymnasiums_form():
-    """As SyncVectorEnv with SAME_STEP would: objects by row, None elsewhere, masks with an underscore."""
-    envs = make_vec(8, noise="off", time_limit_s=0.5)
+def test_the_batch_returns_last_observation_and_info_in_gymnasiums_form():
+    """As SyncVectorEnv does with SAME_STEP: objects by row, None elsewhere, masks with an underscore."""
+    envs = make_vec(8, randomization="off", time_limit_s=0.5)
     envs.reset(seed=1)
     ends = 0
     for _ in range(60):
@@ -184,24 +184,31 @@ def test_gymnasiums_episode_statistics_work_on_the_batch():
 
 
 def test_settings_reach_the_environment():
-    env = make(stage=1, noise="off", control_rate_hz=200).unwrapped
+    env = make(stage=1, randomization="off", control_rate_hz=200).unwrapped
     env.reset(seed=1)
 
-    played = EnvConfig(
-        noise="off",
+    played = TaskConfig(
+        randomization="off",
         control_rate_hz=200,
         observation=PAPER_OBSERVATION,
-        foresee=0.0,
-        go_on=0.0,
-        hindsight=False,
     )
-    assert env._table.env.config == played
-    assert env._table.env.stage == 1
+    assert env._batch.env.task == played
+    assert env._batch.env.stage == 1
+
+
+@pytest.mark.parametrize(("settings", "shares"), [({}, (0.0, 0.0)), ({"end_at_hit_share": 0.8}, (0.8, 0.0))])
+def test_every_rally_is_played_to_its_end_by_default(settings, shares):
+    env = make(**settings).unwrapped
+    env.reset(seed=1)
+
+    experience = env._batch.env.experience
+    assert (experience.end_at_hit_share, experience.continue_share) == shares
+    assert not experience.hit_correction
 
 
 @pytest.mark.parametrize("observation", [ObservationConfig(), {"history": 4}, PAPER_OBSERVATION])
 def test_the_simulators_truth_is_in_no_observation(observation):
-    """The options of a policy in the box say what its critic saw in training."""
+    """The options of a policy in the box say what its critic observed in training."""
     seen = size(policy_layout(ObservationConfig.model_validate(observation)))
     env, envs = make(observation=observation), make_vec(4, observation=observation)
 
@@ -214,10 +221,10 @@ def test_an_unknown_setting_is_refused():
         make(noize="off")
 
 
-def test_the_batch_plays_as_the_environment_behind_it():
-    envs = make_vec(4, noise="off", stage=1)
+def test_the_batch_plays_as_its_inner_environment():
+    envs = make_vec(4, randomization="off", stage=1)
     envs.reset(seed=1)
-    inner = envs.unwrapped._table.env
+    inner = envs.unwrapped._batch.env
 
     assert inner.count == 4
     assert inner.home_action.shape == make_env(1).home_action.shape

@@ -1,4 +1,4 @@
-"""Messages that no service of ours would send: each is refused by its reason, and work goes on."""
+"""Messages that no service of this project sends: each is refused with its reason, and work continues."""
 
 import dataclasses
 
@@ -9,20 +9,20 @@ from common.comms.codec import decode, encode
 from common.comms.keys import Keys
 from common.comms.messages import PolicySnapshot, RallyBatch, StageChange, Status, Verdict
 from common.comms.transport import Flow, NoReply
-from common.env.rally_env import EnvConfig
 from common.policy.weights import load_tensors, save_tensors
-from common.rally.observation import PAPER_OBSERVATION
-from tests.integration.theatre import CURRICULUM, stage, wait_until
+from common.task.config import TaskConfig
+from common.task.observation import PAPER_OBSERVATION
+from tests.integration.in_process_run import CURRICULUM, local_run, wait_until
 from tests.unit.comms.test_codec import sealed
-from tests.unit.learner.rollouts import make_rollout
+from tests.unit.services.learner.rollouts import make_rollout
 
 KEYS = Keys("test")
-PAPER = EnvConfig(observation=PAPER_OBSERVATION)  # as the strangers' rollouts have it
+PAPER = TaskConfig(observation=PAPER_OBSERVATION)  # the task of the client's rollouts
 LONG = CURRICULUM.model_copy(update={"stage_1": 500})
 
 
-class Stranger:
-    """Somebody with a connection who knows how to write a rollout."""
+class ForeignClient:
+    """A program with a connection that can write rollouts."""
 
     def __init__(self, transport):
         self.transport = transport
@@ -34,9 +34,9 @@ class Stranger:
         )
 
     def rollout(self, **changes):
-        """Return one that the learner would take, but for ``changes``."""
-        newest, values = self.policy(), {"actor": "stranger", "run": "test", "sequence": self.sent}
-        for name in ("generation", "version", "stage_number", "contract_hash"):
+        """Return a rollout that the learner accepts, except for ``changes``."""
+        newest, values = self.policy(), {"actor": "client", "run": "test", "sequence": self.sent}
+        for name in ("generation", "version", "stage_number", "training_hash"):
             values[name] = getattr(newest, name)
         self.sent += 1
         return make_rollout(**(values | changes))
@@ -55,63 +55,65 @@ def nan_in(array):
 
 
 def reworded(payload, change):
-    """Return a rollout's bytes after ``change`` to its [type, version, fields], sealed anew."""
+    """Return a rollout's bytes after ``change`` to its [type, version, fields], with a new checksum."""
     content = msgpack.unpackb(payload[12:])
     change(content)
     return sealed(msgpack.packb(content))
 
 
-def test_the_learner_refuses_each_bad_rollout_by_its_reason_and_trains_on(tmp_path):
-    with stage(tmp_path, curriculum=LONG, env=PAPER) as s:
+def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_path):
+    with local_run(tmp_path, curriculum=LONG, task=PAPER) as s:
         learner = s.learner()
-        stranger = Stranger(s.peer())
-        for _ in range(4):  # versions to be behind of
-            assert stranger.verdict(encode(stranger.rollout())).kind == "accepted"
-            assert stranger.verdict(encode(stranger.rollout())).kind == "accepted"
-            version = stranger.sent // 2
-            wait_until(lambda v=version: stranger.policy().version == v, 20, "the update")
-        newest = stranger.policy()
-        whole = encode(stranger.rollout())
+        client = ForeignClient(s.peer())
+        for _ in range(4):  # so that there are older versions
+            assert client.verdict(encode(client.rollout())).kind == "accepted"
+            assert client.verdict(encode(client.rollout())).kind == "accepted"
+            version = client.sent // 2
+            wait_until(lambda v=version: client.policy().version == v, 20, "the update")
+        newest = client.policy()
+        whole = encode(client.rollout())
         spoilt = bytearray(whole)
         spoilt[len(whole) // 2] ^= 1
         bad = [
-            ("stale_stage", "stage number 7; allowed: 0", encode(stranger.rollout(stage_number=7))),
-            ("too_old", "allowed lag: 2", encode(stranger.rollout(version=newest.version - 3))),
-            ("invalid", "the newest is", encode(stranger.rollout(version=newest.version + 1))),
-            ("wrong_contract", "contract c0de", encode(stranger.rollout(contract_hash="c0de"))),
-            ("wrong_generation", "generation 3", encode(stranger.rollout(generation=3))),
-            ("wrong_run", "run other", encode(stranger.rollout(run="other"))),
-            ("invalid", "Rollout.obs", encode(stranger.rollout(obs=nan_in(make_rollout().obs)))),
+            ("stale_stage", "stage number 7; allowed: 0", encode(client.rollout(stage_number=7))),
+            ("too_old", "allowed lag: 2", encode(client.rollout(version=newest.version - 3))),
+            ("invalid", "the newest is", encode(client.rollout(version=newest.version + 1))),
+            ("wrong_contract", "training c0de", encode(client.rollout(training_hash="c0de"))),
+            ("wrong_generation", "generation 3", encode(client.rollout(generation=3))),
+            ("wrong_run", "run other", encode(client.rollout(run="other"))),
+            ("invalid", "Rollout.obs", encode(client.rollout(obs=nan_in(make_rollout().obs)))),
             (
                 "invalid",
                 "Rollout.rewards",
-                encode(stranger.rollout(rewards=make_rollout().rewards + np.float32(np.inf))),
+                encode(client.rollout(rewards=make_rollout().rewards + np.float32(np.inf))),
             ),
-            ("invalid", "36 observations; allowed: 37", encode(narrower(stranger.rollout()))),
-            ("invalid", "3 reward terms", encode(stranger.rollout(reward_terms=np.zeros(3, np.float32)))),
+            ("invalid", "36 observations; allowed: 37", encode(narrower(client.rollout()))),
+            ("invalid", "3 reward terms", encode(client.rollout(reward_terms=np.zeros(3, np.float32)))),
             (
                 "invalid",
                 "rewards of 1e+30",
-                encode(stranger.rollout(rewards=np.full((16, 8), 1e30, np.float32))),
+                encode(client.rollout(rewards=np.full((16, 8), 1e30, np.float32))),
             ),
-            ("invalid", "outcome 200", encode(stranger.rollout(episodes=wild_outcome()))),
-            ("invalid", "version 99", reworded(encode(stranger.rollout()), lambda c: c.__setitem__(1, 99))),
+            ("invalid", "outcome 200", encode(client.rollout(episodes=bad_outcome()))),
+            ("invalid", "version 99", reworded(encode(client.rollout()), lambda c: c.__setitem__(1, 99))),
             ("unreadable", "not readable", bytes(spoilt)),
             ("unreadable", "not readable", b""),
             ("unreadable", "not readable", encode(status())),
         ]
         before = dict(learner.scrape())
-        verdicts = [stranger.verdict(payload) for _, _, payload in bad]
+        verdicts = [client.verdict(payload) for _, _, payload in bad]
         after = learner.scrape()
-        refusal = stranger.send(b"nonsense", KEYS.ctl("learner", "0"))
-        token = stranger.transport.declare_alive("topspin/v1/test/alive/actor/x/²")
+        refusal = client.send(b"nonsense", KEYS.ctl("learner", "0"))
+        token = client.transport.declare_alive("topspin/v1/test/alive/actor/x/²")
         wait_until(
-            lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1, 5, "the wild token"
+            lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1,
+            5,
+            "the invalid token",
         )
         token.close()
         for _ in range(2):
-            stranger.verdict(encode(stranger.rollout()))
-        wait_until(lambda: stranger.policy().version == newest.version + 1, 20, "one more update")
+            client.verdict(encode(client.rollout()))
+        wait_until(lambda: client.policy().version == newest.version + 1, 20, "one more update")
         learner.end()
         ledger = learner.service.ledger()
 
@@ -127,12 +129,12 @@ def test_the_learner_refuses_each_bad_rollout_by_its_reason_and_trains_on(tmp_pa
     assert ledger.lost == 0
 
 
-def test_a_message_over_the_limit_is_not_taken_in_and_others_are_still_served(tmp_path):
-    with stage(tmp_path, curriculum=LONG, env=PAPER, max_message_mib=1) as s:
+def test_a_message_over_the_limit_is_dropped_and_others_are_still_served(tmp_path):
+    with local_run(tmp_path, curriculum=LONG, task=PAPER, max_message_mib=1) as s:
         learner = s.learner()
-        stranger, other = Stranger(s.peer()), Stranger(s.peer())
-        big = encode(stranger.rollout(**{n: getattr(make_rollout(steps=128, envs=96), n) for n in BLOCK}))
-        outcome = stranger.transport.request(KEYS.rollout(), big, 2.0, Flow.ROLLOUT).wait()
+        client, other = ForeignClient(s.peer()), ForeignClient(s.peer())
+        big = encode(client.rollout(**{n: getattr(make_rollout(steps=128, envs=96), n) for n in BLOCK}))
+        outcome = client.transport.request(KEYS.rollout(), big, 2.0, Flow.ROLLOUT).wait()
         for _ in range(2):
             assert other.verdict(encode(other.rollout())).kind == "accepted"
         wait_until(lambda: other.policy().version == 1, 20, "an update")
@@ -143,15 +145,15 @@ def test_a_message_over_the_limit_is_not_taken_in_and_others_are_still_served(tm
     assert learner.service.ledger().balance == 0
 
 
-def test_workers_refuse_what_they_cannot_use_and_play_on(tmp_path):
-    with stage(tmp_path, curriculum=LONG) as s:
+def test_workers_refuse_bad_messages_and_play_on(tmp_path):
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
         s.generator()
         actor, evaluator = s.actor(shards=1), s.evaluator(interval_s=0.1)
         wait_until(lambda: learner.service.training.progress.epoch >= 2, 60, "training")
-        stranger = Stranger(s.peer())
-        publish, request = stranger.transport.publish, stranger.transport.request
-        newest = stranger.policy()
+        client = ForeignClient(s.peer())
+        publish, request = client.transport.publish, client.transport.request
+        newest = client.policy()
         tensors = {name: np.full_like(value, np.nan) for name, value in load_tensors(newest.weights).items()}
         higher = {"generation": newest.generation + 9, "version": 10**6}
         bad_policies = [
@@ -175,12 +177,15 @@ def test_workers_refuse_what_they_cannot_use_and_play_on(tmp_path):
                 "the actor to refuse a policy",
             )
         publish(KEYS.stage(), b"nonsense", Flow.STAGE)
-        publish(KEYS.stage(), encode(StageChange("test", 1, 50, 3, 0, 0, "a lie")), Flow.STAGE)
+        publish(KEYS.stage(), encode(StageChange("test", 1, 50, 3, 0, 0, "wrong")), Flow.STAGE)
         for role in ("actor", "evaluator", "generator"):
             assert request(KEYS.ctl(role, "0"), b"nonsense", 5.0, Flow.CONTROL).wait() is NoReply.NO_SERVER
         request(KEYS.rally(0), b"nonsense", 5.0, Flow.RALLY).wait()
         wait_until(lambda: refused(actor, "stage") == 1, 10, "the actor to refuse a stage")
-        for payload in (b"nonsense", encode(wild_rallies())):  # sent until seen: newer batches push it out
+        for payload in (
+            b"nonsense",
+            encode(bad_rallies()),
+        ):  # sent until it is refused: newer batches push it out
             seen = refused(actor, "rally")
             wait_until(
                 lambda n=seen, p=payload: (
@@ -223,12 +228,12 @@ def narrower(rollout):
     )
 
 
-def wild_outcome():
+def bad_outcome():
     episodes = make_rollout().episodes
     return dataclasses.replace(episodes, outcome=np.full_like(episodes.outcome, 200))
 
 
-def wild_rallies():
+def bad_rallies():
     rallies = np.zeros((4, 11))
     rallies[:, 3] = 1e200
     return RallyBatch(
@@ -240,8 +245,8 @@ def wild_rallies():
         rallies=rallies,
         seeds=np.arange(4, dtype=np.uint64),
         candidates=4,
-        preset="paper",
-        noise="standard",
+        launch="paper",
+        randomization="standard",
     )
 
 

@@ -1,38 +1,31 @@
-"""Services that come late, die, come back or are missing: nobody waits for ever, and every rollout is accounted for."""
+"""Services that start late, die, return or are missing: no service waits for ever, and the ledger balances."""
 
 import logging
-import shutil
 import threading
 import time
 
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import load_file
 
 from common.comms.messages import VerdictKind
 from common.comms.transport import TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.env.rally_env import EnvConfig
 from common.policy.actor_critic import NetworkConfig
-from common.policy.weights import load_policy, save_policy
-from services.actor.service import NoRalliesError
-from services.learner.checkpoint import CheckpointError, checkpoints
+from common.policy.folder import load_policy, save_policy
+from common.task.config import TaskConfig
+from services.actor.rally_feed import NoRalliesError
+from services.learner.checkpoint import CheckpointError
 from services.learner.intake import IntakeConfig
-from services.learner.service import DivergedError, RunExistsError
-from tests.integration.theatre import CURRICULUM, free_endpoint, stage, wait_until
+from services.learner.service import RunExistsError
+from tests.integration.in_process_run import CURRICULUM, LONG, free_endpoint, local_run, progress, wait_until
 
-LONG = CURRICULUM.model_copy(update={"stage_3": 500})
 SYNCHRONOUS = {"intake": IntakeConfig(dataset_rollouts=2, max_lag=0)}
 
 
-def progress(learner):
-    return learner.service.training.progress
-
-
 def state_of(training):
-    """Return everything that decides how training goes on, as arrays."""
+    """Return everything that decides further training, as arrays."""
     state = {f"network.{name}": value.numpy().copy() for name, value in training.network.state_dict().items()}
     for index, values in training.optimizer.state_dict()["state"].items():
         state |= {f"adam.{index}.{name}": value.numpy().copy() for name, value in values.items()}
@@ -49,8 +42,8 @@ def assert_same_state(one, other):
         np.testing.assert_array_equal(value, other[name], err_msg=name)
 
 
-def test_an_actor_that_comes_late_gets_policy_and_stage_and_takes_part(tmp_path):
-    with stage(tmp_path, curriculum=CURRICULUM.model_copy(update={"stage_2": 500})) as s:
+def test_an_actor_that_starts_late_gets_policy_and_stage_and_takes_part(tmp_path):
+    with local_run(tmp_path, curriculum=CURRICULUM.model_copy(update={"stage_2": 500})) as s:
         learner = s.learner()
         s.generator()
         first = s.actor(0)
@@ -70,16 +63,16 @@ def test_an_actor_that_comes_late_gets_policy_and_stage_and_takes_part(tmp_path)
     assert learner.service.ledger().balance == 0
 
 
-def test_a_learner_that_waits_for_its_first_actor_has_not_been_without_a_checkpoint_since_1970(tmp_path):
+def test_the_checkpoint_time_of_a_new_learner_is_its_start_and_not_1970(tmp_path):
     started = time.time()
-    with stage(tmp_path) as s:
+    with local_run(tmp_path) as s:
         waiting = s.learner(run=False).metric("topspin_checkpoint_time_seconds")
 
     assert started <= waiting <= time.time()
 
 
 def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_path):
-    with stage(tmp_path, curriculum=LONG) as s:
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
         s.generator()
         victim, other = s.actor(0), s.actor(1)
@@ -97,14 +90,14 @@ def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_
         published = sum(entry.service.counts.published for entry in (victim, other, again))
 
     assert ledger.balance == 0
-    # what it had numbered and never sent, nobody knows of
+    # rollouts that it numbered and never sent are unknown to the learner
     assert published - 2 <= ledger.published <= published
     assert ledger.lost <= 2
     assert ledger.refused == {}
 
 
-def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp_path):
-    with stage(tmp_path, curriculum=LONG) as s:
+def test_a_restarted_learner_continues_from_its_checkpoint_and_its_actors_follow(tmp_path):
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
         s.generator()
         actors = [s.actor(0), s.actor(1)]
@@ -139,8 +132,8 @@ def test_a_learner_that_restarts_goes_on_where_it_was_and_its_actors_with_it(tmp
     assert min(reconnects) >= 1
 
 
-def test_an_actor_that_leaves_sends_what_no_learner_has_answered_yet(tmp_path):
-    with stage(tmp_path, curriculum=LONG) as s:
+def test_an_actor_that_leaves_sends_its_unanswered_rollouts(tmp_path):
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
         s.generator()
         actor = s.actor(0, run=False)
@@ -165,17 +158,15 @@ def test_an_actor_that_leaves_sends_what_no_learner_has_answered_yet(tmp_path):
 
     assert left.in_flight == left.balance == 0
     assert ledger.balance == 0
-    assert ledger.lost == left.accepted - ledger.trained  # what the first learner took along, untrained
+    assert ledger.lost == left.accepted - ledger.trained  # accepted by the first learner and not trained
     assert ledger.published == left.published
 
 
 @pytest.mark.parametrize(
     ("budget", "spent"), [({"frames": 2048}, "2,048 of 2,048 frames"), ({"minutes": 0.02}, "of 0.02 minutes")]
 )
-def test_a_learner_that_goes_on_with_its_budget_spent_says_so_and_trains_nothing(
-    tmp_path, caplog, budget, spent
-):
-    with stage(tmp_path, curriculum=LONG) as s:
+def test_a_resumed_learner_with_a_spent_budget_logs_it_and_trains_nothing(tmp_path, caplog, budget, spent):
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner(**budget)
         s.generator()
         actors = [s.actor(0), s.actor(1)]
@@ -188,18 +179,18 @@ def test_a_learner_that_goes_on_with_its_budget_spent_says_so_and_trains_nothing
         trained = progress(learner).epoch, progress(again).epoch
 
     assert trained[0] == trained[1] > 0
-    assert f"{spent} are trained, through all restarts; give --minutes or --frames more" in caplog.text
+    assert f"{spent} are trained, through all restarts; raise --minutes or --frames" in caplog.text
 
 
 def test_a_second_run_does_not_overwrite_the_first_ones_checkpoints(tmp_path):
-    with stage(tmp_path) as s:
+    with local_run(tmp_path) as s:
         s.take_down(s.learner())
         with pytest.raises(RunExistsError, match="go on with --resume, or choose another --run"):
             s.learner()
 
 
 def test_a_resume_that_does_not_fit_leaves_the_runs_settings_as_they_were(tmp_path):
-    with stage(tmp_path) as s:
+    with local_run(tmp_path) as s:
         s.take_down(s.learner())
         before = (tmp_path / "config.toml").read_text()
         with pytest.raises(CheckpointError, match="doesn't fit this configuration"):
@@ -209,7 +200,7 @@ def test_a_resume_that_does_not_fit_leaves_the_runs_settings_as_they_were(tmp_pa
 
 
 def synchronous_run(folder, gate=0.0):
-    with stage(folder, curriculum=CURRICULUM.model_copy(update={"catch_gate": gate}), **SYNCHRONOUS) as s:
+    with local_run(folder, curriculum=CURRICULUM.model_copy(update={"catch_gate": gate}), **SYNCHRONOUS) as s:
         learner = s.learner()
         s.generator(shards=1)
         actor = s.actor(shards=1, rallies="ask")
@@ -237,7 +228,7 @@ def test_a_gate_ends_a_stage_early_and_no_accepted_rollout_is_lost(tmp_path):
     curriculum = CURRICULUM.model_copy(
         update={"stage_1": 400, "stage_2": 4, "stage_3": 4, "catch_gate": 1e-6}
     )
-    with stage(tmp_path, curriculum=curriculum, frames=20_000) as s:
+    with local_run(tmp_path, curriculum=curriculum, frames=20_000) as s:
         learner = s.learner()
         s.generator()
         actors = [s.actor(0, envs=32), s.actor(1, envs=32)]
@@ -252,8 +243,8 @@ def test_a_gate_ends_a_stage_early_and_no_accepted_rollout_is_lost(tmp_path):
     assert (ledger.lost, ledger.refused) == (0, {})
 
 
-def test_a_reproducible_actor_says_that_its_generator_is_missing(tmp_path):
-    with stage(tmp_path, **SYNCHRONOUS) as s:
+def test_a_reproducible_actor_names_the_missing_generator(tmp_path):
+    with local_run(tmp_path, **SYNCHRONOUS) as s:
         learner = s.learner()
         generator = s.generator(shards=1, batch=1)
         actor = s.actor(shards=1, rallies="ask", rally_wait_s=1.0, envs=4)
@@ -266,12 +257,14 @@ def test_a_reproducible_actor_says_that_its_generator_is_missing(tmp_path):
         learner.end()
 
 
-def test_a_generator_idles_while_nobody_listens(tmp_path):
-    with stage(tmp_path) as s:
+def test_a_generator_idles_without_subscribers(tmp_path):
+    with local_run(tmp_path) as s:
         s.learner()
         generator = s.generator()
         wait_until(
-            lambda: generator.service.state == "idle" and generator.service._next_status > 0, 10, "idleness"
+            lambda: generator.service.state == "idle" and generator.service._member._next_status > 0,
+            10,
+            "idleness",
         )
         silent = generator.scrape()["topspin_rallies_published_total"]
         subscription = s.peer().subscribe("topspin/v1/test/rally/1", capacity=8)
@@ -283,7 +276,7 @@ def test_a_generator_idles_while_nobody_listens(tmp_path):
     assert silent == 0
 
 
-def test_who_finds_no_learner_says_whom_it_waits_for_and_ends_with_one_line(caplog):
+def test_without_a_learner_a_service_logs_its_wait_and_ends_with_one_line(caplog):
     endpoint = free_endpoint()
     with (
         caplog.at_level(logging.INFO),
@@ -297,18 +290,18 @@ def test_who_finds_no_learner_says_whom_it_waits_for_and_ends_with_one_line(capl
     assert f"waiting for the hub endpoint={endpoint}" in caplog.text
 
 
-def test_the_learner_says_where_it_listens_and_the_command_that_starts_actors(tmp_path, caplog):
-    with caplog.at_level(logging.INFO), stage(tmp_path, silence_warning_s=0.1) as s:
+def test_the_learner_logs_its_endpoint_and_the_command_that_starts_actors(tmp_path, caplog):
+    with caplog.at_level(logging.INFO), local_run(tmp_path, silence_warning_s=0.1) as s:
         learner = s.learner()
-        wait_until(lambda: "waiting for=actors" in caplog.text, 5, "the learner to say whom it waits for")
+        wait_until(lambda: "waiting for=actors" in caplog.text, 5, "the learner's warning")
         learner.end()
 
     assert f"listening endpoint={s.endpoint}" in caplog.text
     assert f"python -m services.actor --run test --endpoint {s.endpoint}" in caplog.text
 
 
-def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
-    with stage(tmp_path, curriculum=LONG) as s:
+def test_a_restarted_evaluator_keeps_its_best_policy(tmp_path):
+    with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
         s.generator()
         s.actor(0, shards=1)
@@ -320,7 +313,10 @@ def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
         wait_until(folder.exists, 10, "a best policy")
         s.take_down(evaluator)
         best = load_policy(folder)
-        measures = best.contract.measures | {"return_rate": 1.0, "target_error_mean": 0.0}  # not to be beaten
+        measures = best.contract.measures | {
+            "return_rate": 1.0,
+            "target_error_mean": 0.0,
+        }  # the best possible
         unbeaten = best.contract.model_copy(update={"stage": 3, "measures": measures})
         save_policy(folder, best.network, best.moments, unbeaten)
         again = s.evaluator()
@@ -332,74 +328,24 @@ def test_an_evaluator_that_comes_back_keeps_the_best_it_had(tmp_path):
 
 
 def test_an_evaluator_of_another_task_refuses_the_policy_as_actors_do(tmp_path, caplog):
-    """Its shapes fit: it would play with other settings than the policy's, and keep it with a wrong contract."""
-    with stage(tmp_path, curriculum=LONG) as s:
+    """The shapes fit: the evaluator would play with other settings than the policy's, and save a wrong contract."""
+    with local_run(tmp_path, curriculum=LONG) as s:
         s.learner()
-        stranger = s.evaluator(env=EnvConfig(control_rate_hz=100))
-        wait_until(
-            lambda: stranger.metric("topspin_messages_refused_total", kind="policy") > 0, 30, "a refusal"
-        )
+        other = s.evaluator(task=TaskConfig(control_rate_hz=100))
+        wait_until(lambda: other.metric("topspin_messages_refused_total", kind="policy") > 0, 30, "a refusal")
 
-    assert stranger.service.evaluations == 0
-    assert "start both with the same network, env and launch settings" in caplog.text
+    assert other.service.evaluations == 0
+    assert "start both with the same [task], [network] and [experience] settings" in caplog.text
     assert not (tmp_path / "policy" / "best").exists()
 
 
-def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):
-    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=0.2) as s:
-        learner = s.learner()
-        s.generator()
-        s.actor(0, shards=1)
-        good = tmp_path / "checkpoints" / "good"
-        wait_until(lambda: good.exists() and any(good.iterdir()), 60, "a good checkpoint")
-        with torch.no_grad():
-            learner.service.training.network.mean.weight[:] = float("nan")
-        wait_until(lambda: learner.metric("topspin_rollbacks_total") == 1, 30, "a way back")
-        version = progress(learner).version
-        wait_until(lambda: progress(learner).version > version + 2, 30, "epochs after it")
-        weights = learner.service.training.network.mean.weight
-
-    assert progress(learner).rollbacks == 1
-    assert bool(weights.isfinite().all())
-
-
-def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
-    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
-        learner = s.learner()
-        s.generator()
-        s.actor(0, shards=1)
-        begun = LONG.stage_1 + LONG.stage_2
-        wait_until(lambda: progress(learner).epoch > begun, 60, "stage 3")
-        kept = [path.stem for path in checkpoints(tmp_path / "checkpoints" / "good")]
-
-    assert kept == [f"{begun:08d}"]
-
-
-def test_a_run_that_diverges_with_nothing_to_go_back_to_ends_with_one_line(tmp_path):
-    with stage(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
-        learner = s.learner()
-        s.generator()
-        s.actor(0, shards=1)
-        policy = tmp_path / "policy" / "latest"  # written last of the one save that there is
-        wait_until(policy.exists, 60, "a checkpoint")
-        wait_until(lambda n=progress(learner).epoch: progress(learner).epoch > n, 30, "an epoch after it")
-        shutil.rmtree(tmp_path / "checkpoints" / "good", ignore_errors=True)
-        with torch.no_grad():
-            learner.service.training.network.mean.weight[:] = float("nan")
-        with pytest.raises(DivergedError, match="no good checkpoint to go back to"):
-            learner.join(30)
-        newest = checkpoints(tmp_path / "checkpoints")[-1]
-
-    assert bool(np.isfinite(load_file(newest)["network.mean.weight"]).all())
-
-
-def test_an_actor_that_runs_out_of_rallies_says_so_once(tmp_path, caplog):
+def test_an_actor_that_runs_out_of_rallies_logs_it_once(tmp_path, caplog):
     curriculum = CURRICULUM.model_copy(update={"stage_1": 40, "stage_2": 0, "stage_3": 0})
-    with caplog.at_level(logging.INFO), stage(tmp_path, curriculum=curriculum) as s:
+    with caplog.at_level(logging.INFO), local_run(tmp_path, curriculum=curriculum) as s:
         s.learner()
-        s.generator(shards=1, batch=16, rate_hz=0.1)  # enough to begin with, and then none
+        s.generator(shards=1, batch=16, rate_hz=0.1)  # enough for the start, and then none
         actor = s.actor(shards=1)
-        wait_until(lambda: "rallies run out" in caplog.text, 60, "the actor to say what it lacks")
+        wait_until(lambda: "rallies run out" in caplog.text, 60, "the actor's warning")
         wait_until(
             lambda: actor.metric("topspin_rollouts_published_total") > 20, 60, "some more blocks to be played"
         )

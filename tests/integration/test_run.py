@@ -3,9 +3,9 @@
 import csv
 import json
 
-from common.env.rally_env import EnvConfig
-from common.policy.weights import load_policy
-from tests.integration.theatre import CURRICULUM, stage, wait_until
+from common.policy.folder import load_policy
+from common.task.experience import ExperienceConfig
+from tests.integration.in_process_run import CURRICULUM, local_run, wait_until
 from tests.unit.env.teachers import write_teacher
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
@@ -16,8 +16,8 @@ def ledger(scraped):
 
 
 def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_path):
-    with stage(tmp_path) as s:
-        learner = s.learner()  # the hub: it must listen before the others dial it
+    with local_run(tmp_path) as s:
+        learner = s.learner()  # the hub: it must listen before the others connect
         generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
         wait_until(lambda: learner.service.training.progress.stage == 3, 60, "stage 3")
         wait_until(
@@ -41,7 +41,7 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
     assert (progress.epoch, progress.stage, progress.stage_number) == (8, 3, 2)
     with (tmp_path / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    # a row tells the stage after its epoch: three of stage 1 end with the change to 2
+    # a row has the stage after its epoch: the third of stage 1 already has stage 2
     assert [int(row["stage"]) for row in rows] == [1, 1, 2, 2, 3, 3, 3, 3]
     assert max(float(row["lag"]) for row in rows) <= 2
     assert load_policy(tmp_path / "policy" / "latest").contract.version == 8
@@ -51,13 +51,14 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
     assert list((tmp_path / "tb").iterdir())
 
 
-def test_a_taught_run_learns_from_its_teacher_first_and_from_rewards_then(tmp_path):
-    task = EnvConfig(teacher=write_teacher(tmp_path / "teacher").model_copy(update={"epochs": 3}))
-    with stage(
+def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp_path):
+    teacher = write_teacher(tmp_path / "teacher").model_copy(update={"epochs": 3})
+    experience = ExperienceConfig(teacher=teacher)
+    with local_run(
         tmp_path / "run", curriculum=CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6})
     ) as s:
-        learner = s.learner(env=task)
-        generator, actors = s.generator(), [s.actor(k, env=task) for k in range(2)]
+        learner = s.learner(experience=experience)
+        generator, actors = s.generator(), [s.actor(k, experience=experience) for k in range(2)]
         learner.join(60)
         for entry in (*actors, generator):
             entry.end()

@@ -1,4 +1,4 @@
-"""Commands as a person types them, in a folder of their own, and what they print."""
+"""Commands as a user types them, each in its own folder, and their outputs."""
 
 import contextlib
 import json
@@ -49,7 +49,7 @@ class Command:
 
 @contextlib.contextmanager
 def running(folder, module, *arguments):
-    """Yield `python -m module arguments` at work in ``folder``; it is killed if it still runs at the end."""
+    """Yield `python -m module arguments`, run in ``folder``; it is killed if it still runs at the end."""
     name = f"{module}-{time.monotonic_ns()}"
     out, err = folder / f"{name}.out", folder / f"{name}.err"
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TOPSPIN_")}
@@ -81,7 +81,7 @@ def last_json(text):
 
 
 def processes_in(folder):
-    """Return the Python processes that work in ``folder``, after those that are ending had their time."""
+    """Return the Python processes that work in ``folder``, after a wait for those that are ending."""
     deadline = time.monotonic() + 15
     while True:
         found = []

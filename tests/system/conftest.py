@@ -5,7 +5,7 @@ from tests.system.commands import processes_in
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind(tmp_path):
-    """Whatever a test started, no process that names its folder survives it."""
+    """After a test, no process that names its folder is alive."""
     yield
     left = processes_in(tmp_path)
     for process in left:

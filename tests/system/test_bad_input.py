@@ -1,4 +1,4 @@
-"""What a person can get wrong: an exit status and one clear line each, no traceback, nothing left behind."""
+"""User mistakes: each gives an exit status and one clear line, without a traceback or leftover processes."""
 
 import re
 import socket
@@ -9,12 +9,7 @@ from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from tests.system.commands import TINY, run, running, wait_until
 
-DEPLOY, LEARNER, ACTOR, EVALUATOR = (
-    "deploy.local",
-    "services.learner",
-    "services.actor",
-    "services.evaluator",
-)
+DEPLOY, LEARNER, ACTOR, TOPSPIN = ("deploy.local", "services.learner", "services.actor", "topspin")
 
 
 def one_line(folder, module, *arguments):
@@ -24,7 +19,8 @@ def one_line(folder, module, *arguments):
     assert status not in (0, None), err
     assert "Traceback" not in err
     assert out == ""
-    assert sum(line.startswith(f"python -m {module}: ") for line in lines) == 1, err
+    prog = f"python -m {module}" if module != TOPSPIN else "topspin"
+    assert sum(line.startswith(prog) for line in lines) == 1, err
     return status, lines[-1]
 
 
@@ -45,18 +41,18 @@ def one_line(folder, module, *arguments):
         (DEPLOY, "--resume", 2, "--resume needs --run NAME"),
         (
             DEPLOY,
-            "--run nobody --resume",
+            "--run unknown --resume",
             2,
-            "run 'nobody' can't be resumed: there is no runs/nobody/config.toml",
+            "run 'unknown' can't be resumed: there is no runs/unknown/config.toml",
         ),
         (DEPLOY, "--config nowhere.toml", 2, "can't read nowhere.toml: No such file"),
         (LEARNER, "--ppo.clipp 0.2", 2, r"unknown flag --ppo.clipp; did you mean '--ppo.clip'\?"),
         (LEARNER, "--endpoint udp/here", 2, "learner.endpoint = 'udp/here'"),
         (
             LEARNER,
-            "--run nobody --resume",
+            "--run unknown --resume",
             1,
-            "nothing to resume in runs/nobody/checkpoints: no checkpoint there",
+            "nothing to resume in runs/unknown/checkpoints: no checkpoint there",
         ),
         (
             ACTOR,
@@ -64,20 +60,37 @@ def one_line(folder, module, *arguments):
             1,
             "no hub answered .* start the learner",
         ),
-        (LEARNER, "--env.teacher.policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
         (
             LEARNER,
-            "--env.teacher.policy p --ppo.correction-weight 0",
+            "--experience.teacher.policy nowhere",
+            1,
+            "no policy 'nowhere'; allowed: a policy folder, or one",
+        ),
+        (
+            LEARNER,
+            "--experience.teacher.policy p --ppo.correction-weight 0",
             2,
-            "ppo.correction_weight 0 beside env.teacher.policy",
+            "ppo.correction_weight 0 with experience.teacher.policy",
         ),
         (
             DEPLOY,
-            "--env.teacher.policy p --learner.ppo.correction-weight 0",
+            "--experience.teacher.policy p --learner.ppo.correction-weight 0",
             1,
-            "ppo.correction_weight 0 beside env.teacher.policy",
+            "ppo.correction_weight 0 with experience.teacher.policy",
         ),
-        (EVALUATOR, "--policy nowhere", 1, "no policy in .*nowhere: No such file or directory"),
+        (
+            TOPSPIN,
+            "evaluate --policy nowhere",
+            1,
+            "no policy 'nowhere'; allowed: a policy folder, or one of default, paper",
+        ),
+        (
+            TOPSPIN,
+            "evaluate --rallies 0",
+            2,
+            r"evaluate.rallies = '0' \(--rallies\); allowed: a whole number, from 1",
+        ),
+        (TOPSPIN, "pley", 2, "unknown command 'pley'; did you mean 'play'"),
     ],
 )
 def test_a_mistake_ends_with_one_line_that_says_what_is_allowed(tmp_path, module, flags, status, line):
@@ -112,21 +125,22 @@ def test_a_taken_port_of_the_metrics_is_named_before_anything_starts(tmp_path):
     assert alone[0] == 1
     assert f"127.0.0.1:{port}" in alone[1]
     assert whole[0] == 2
-    assert f"port {port} can't be had: Address already in use" in whole[1]
+    assert f"port {port} can't be used: Address already in use" in whole[1]
     assert not (tmp_path / "runs" / "r").exists()
 
 
-def test_unreadable_files_are_named_with_what_is_wrong_in_them(tmp_path):
+def test_unreadable_files_are_named_with_their_faults(tmp_path):
     policy = tmp_path / "policy"
     policy.mkdir()
-    (policy / "contract.json").write_text('{"format": 1}')
+    (policy / "contract.json").write_text('{"format": 2}')
     (policy / "weights.safetensors").write_bytes(b"rubbish")
     checkpoints = tmp_path / "runs" / "r" / "checkpoints"
     checkpoints.mkdir(parents=True)
     (checkpoints / "00000001.safetensors").write_bytes(b"rubbish")
 
     assert (
-        "contract.json: observation: Field required" in one_line(tmp_path, EVALUATOR, "--policy", policy)[1]
+        "contract.json: observation: Field required"
+        in one_line(tmp_path, TOPSPIN, "evaluate", "--policy", policy)[1]
     )
     assert (
         "checkpoint runs/r/checkpoints/00000001.safetensors is not readable"
@@ -135,7 +149,7 @@ def test_unreadable_files_are_named_with_what_is_wrong_in_them(tmp_path):
     assert "go on with --resume, or choose another --run" in one_line(tmp_path, LEARNER, "--run", "r")[1]
 
 
-def test_a_run_is_not_begun_again_by_accident(tmp_path):
+def test_a_run_is_not_started_again_by_accident(tmp_path):
     (tmp_path / "runs" / "r").mkdir(parents=True)
     (tmp_path / "runs" / "r" / "config.toml").write_text("")
 
@@ -156,7 +170,7 @@ def test_a_run_started_service_by_service_is_not_resumed_as_a_whole(tmp_path):
     assert config.read_text() == "[learner]\nseed = 3\n"
 
 
-def test_a_run_that_is_alive_is_not_begun_or_resumed_beside_itself(tmp_path):
+def test_a_live_run_is_not_started_or_resumed_a_second_time(tmp_path):
     folder = tmp_path / "runs" / "r"
     with running(tmp_path, DEPLOY, "--run", "r", *TINY) as first:
         wait_until(lambda: list((folder / "checkpoints").glob("*.safetensors")), 90, "a checkpoint")
@@ -168,14 +182,14 @@ def test_a_run_that_is_alive_is_not_begun_or_resumed_beside_itself(tmp_path):
         first.wait(60)
 
     assert whole[1].startswith(
-        f"python -m deploy.local: run 'r' is alive: deploy.local, process {first.process.pid}, is at work"
+        f"python -m deploy.local: run 'r' is alive: deploy.local, process {first.process.pid}, uses"
     )
-    assert re.search(r"run 'r' is alive: learner, process \d+, is at work in runs/r; end it first", alone[1])
+    assert re.search(r"run 'r' is alive: learner, process \d+, uses runs/r; end it first", alone[1])
     assert (whole[0], alone[0]) == (1, 1)
     assert (folder / "config.toml").read_text() == config
 
 
-def test_an_actor_at_a_hub_without_a_learner_says_whom_it_waits_for_and_ends_when_asked(tmp_path):
+def test_an_actor_without_a_learner_logs_its_wait_and_ends_on_a_signal(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"

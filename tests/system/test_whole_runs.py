@@ -1,4 +1,4 @@
-"""Whole runs as a person starts them: every service a process of its own."""
+"""Whole runs as a user starts them, with one process per service."""
 
 import csv
 import json
@@ -9,7 +9,7 @@ import tomllib
 
 import pytest
 
-from common.policy.weights import load_policy
+from common.policy.folder import load_policy
 from tests.system.commands import STAGES, TINY, children_of, last_json, run, running, wait_until
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
@@ -24,7 +24,7 @@ def rows(folder, name="r"):
         return list(csv.DictReader(file))
 
 
-def test_a_run_goes_through_its_stages_and_leaves_a_whole_folder_and_one_json_line(tmp_path):
+def test_a_run_goes_through_its_stages_and_leaves_a_complete_folder_and_one_json_line(tmp_path):
     status, out, err = run(
         tmp_path,
         "deploy.local",
@@ -51,7 +51,7 @@ def test_a_run_goes_through_its_stages_and_leaves_a_whole_folder_and_one_json_li
     for name in MEASURES:
         low, high = line[f"{name}_ci"]
         assert 0 <= low <= (line[name] or 0.0) <= high <= 1
-    assert {"target_error_mean", "target_error_median", "launch", "noise"} <= line.keys()
+    assert {"target_error_mean", "target_error_median", "launch", "randomization"} <= line.keys()
     assert ledger["published"] == sum(ledger[fate] for fate in FATES)
     assert (ledger["trained"], ledger["lost"], ledger["dropped"], ledger["refused"]) == (18, 0, 0, 0)
     assert [int(row["stage"]) for row in rows(tmp_path)] == [1, 1, 2, 2, 3, 3, 3, 3, 3]
@@ -59,7 +59,7 @@ def test_a_run_goes_through_its_stages_and_leaves_a_whole_folder_and_one_json_li
     assert load_policy(folder / "policy" / "best").contract.measures["rallies"] == 20
     assert list((folder / "checkpoints").glob("*.safetensors"))
     assert list((folder / "tb").iterdir())
-    assert {"deploy", "learner-0", "generator-0", "actor-0", "actor-1", "evaluator-0", "evaluation"} <= {
+    assert {"deploy", "learner-0", "generator-0", "actor-0", "actor-1", "evaluator-0"} <= {
         path.stem for path in (folder / "logs").iterdir()
     }
     assert (tmp_path / "runs" / "latest").resolve() == folder
@@ -71,7 +71,7 @@ def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_inter
         wait_until(lambda: len(rows(tmp_path)) >= 6, 90, "stage 3")
         wait_until((tmp_path / "runs" / "r" / "logs" / "spare.log").exists, 30, "a spare process")
         epoch = len(rows(tmp_path))
-        wait_until(lambda: len(rows(tmp_path)) >= epoch + 50, 30, "the run to be well under way")
+        wait_until(lambda: len(rows(tmp_path)) >= epoch + 50, 30, "more epochs")
         before = children_of(tmp_path, "actor")
         victim = next(process for process in before.values() if "--id" in process.cmdline())
         index = victim.cmdline()[victim.cmdline().index("--id") + 1]
@@ -80,7 +80,7 @@ def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_inter
         victim.kill()
         killed = time.monotonic()
         wait_until(
-            lambda: log.read_text().count("policy received") > policies, 30, "the killed actor to be back"
+            lambda: log.read_text().count("policy received") > policies, 30, "the killed actor to return"
         )
         took = time.monotonic() - killed
         epoch = len(rows(tmp_path))
@@ -104,7 +104,7 @@ def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_inter
     assert again == 0, err_again
     assert second["frames"] == first["frames"] + 20 * 1024
     assert second["ledger"]["published"] == sum(second["ledger"][fate] for fate in FATES)
-    # the first part's rows stand, and the second's follow without a gap: its settings were the first's
+    # the second part's rows follow the first's without a gap: it had the same settings
     assert retrained[: len(trained)] == trained
     assert [int(row["epoch"]) for row in retrained] == list(range(1, len(trained) + 21))
     assert second["ledger"]["trained"] == 2 * len(retrained)
@@ -134,7 +134,13 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
             wait_until(lambda: len(rows(tmp_path)) >= 20, 90, "training")
             first.process.kill()
         frames = int(rows(tmp_path)[-1]["frames"])
-        resume = ("--run", "r", "--resume", "--frames", frames + 30_000)  # all else stands in config.toml
+        resume = (
+            "--run",
+            "r",
+            "--resume",
+            "--frames",
+            frames + 30_000,
+        )  # the other settings are in config.toml
         with running(tmp_path, "services.learner", *resume) as second:
             status, _, err = second.wait(60)
         actor.process.send_signal(signal.SIGTERM)
@@ -143,15 +149,13 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
 
     assert status == 0, err
     assert "resumed file=runs/r/checkpoints/" in err
-    recorded = tomllib.loads((tmp_path / "runs" / "r" / "config.toml").read_text())["learner"]
-    assert (recorded["frames"], recorded["seed"], recorded["resume"]) == (frames + 30_000, 1, False)
+    recorded = tomllib.loads((tmp_path / "runs" / "r" / "config.toml").read_text())
+    assert (recorded["frames"], recorded["seed"], recorded["run"]) == (frames + 30_000, 1, "r")
     assert actor_status == 0, actor_err
     assert "Traceback" not in actor_err
     assert len(set(re.findall(r"policy received generation=(\d+)", actor_err))) == 2
     epochs = [int(row["epoch"]) for row in rows(tmp_path)]
-    assert epochs == list(
-        range(1, len(epochs) + 1)
-    )  # what was trained after the last checkpoint was trained again
+    assert epochs == list(range(1, len(epochs) + 1))  # epochs after the last checkpoint are trained again
     assert log.frames >= frames + 30_000
     assert (log.stage, int(rows(tmp_path)[-1]["stage"])) == (3, 3)
 
@@ -160,11 +164,13 @@ def test_a_second_interrupt_ends_everything_at_once(tmp_path):
     with running(tmp_path, "deploy.local", "--run", "r", "--actors", 1, *TINY) as command:
         wait_until(lambda: len(rows(tmp_path)) >= 1, 90, "the first epoch")
         command.process.send_signal(signal.SIGINT)
-        wait_until(lambda: "stopping signal=SIGINT" in command.err.read_text(), 10, "the first to be heard")
+        wait_until(
+            lambda: "stopping signal=SIGINT" in command.err.read_text(), 10, "the first signal's log line"
+        )
         command.process.send_signal(signal.SIGINT)
         status, _, _ = command.wait(5)
 
-    assert status == 130  # and no process is left behind: the fixture looks
+    assert status == 130  # the fixture checks that no process is left
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -1,4 +1,4 @@
-"""The benchmark of the ball's physics, on recordings that our own physics made: it must find next to no error."""
+"""The benchmark of the ball's physics on recordings that our own physics made: it must find almost no error."""
 
 import json
 import subprocess
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.physics_reality import LABELS, measure
-from common.real2sim.tracks import RecordingError, Recordings, States, Track
-from tests.unit.real2sim.flights import launch_of, seen
+from tests.unit.topspin.real2sim.flights import launch_of, seen
+from topspin.real2sim.formats.tracks import RecordingError, Recordings, States, Track
 
 SPINS = {"topspin": (0.0, -45.0, 0.0), "backspin": (0.0, 45.0, 0.0), "no_spin": (0.0, 0.0, 0.0)}
 
@@ -26,13 +26,13 @@ def recordings(duration=0.7):
     return [Recordings("made", tuple(tracks), States.none(), {"a reason": 2})]
 
 
-def test_our_own_balls_are_explained_to_the_cameras_noise():
+def test_the_errors_on_our_own_balls_are_the_cameras_noise():
     found = measure(recordings(), "simple")
 
     assert found["tracks"] == dict.fromkeys(LABELS, 2)
     assert (found["bounces"], found["bounces_measured"], found["dropped"]) == (6, 6, {"a reason": 2})
     for label in LABELS:
-        # 3-D noise: 1 mm in three axes, and .35 ms at 5 m/s
+        # 3-D noise: 1 mm in three axes, and 0.35 ms at 5 m/s
         assert found[f"fit_rms_mm_{label}"] == pytest.approx(np.hypot(np.sqrt(3.0), 0.35 * 5.0), rel=0.2)
     assert found["bounce_prediction_mm_median"] < 12.0
     assert found["after_bounce_mm_median"] < 8.0
@@ -43,7 +43,7 @@ def test_our_own_balls_are_explained_to_the_cameras_noise():
         assert found[less]["fit_rms_mm_topspin"] > 2.0 * better["fit_rms_mm_topspin"]
 
 
-def test_what_no_track_shows_is_null():
+def test_figures_that_no_track_shows_are_null():
     found = measure(recordings(duration=0.4), "simple")
 
     assert (found["bounces"], found["bounce_prediction_mm_median"], found["after_bounce_mm_p90"]) == (
@@ -54,7 +54,7 @@ def test_what_no_track_shows_is_null():
     assert json.loads(json.dumps(found)) == found
 
 
-def test_nothing_to_measure_is_an_error():
+def test_recordings_without_a_usable_track_are_an_error():
     with pytest.raises(RecordingError, match=r"no usable track \(the files hold none\)"):
         measure([Recordings("made", (), States.none(), {})], "simple")
 
@@ -69,4 +69,6 @@ def test_a_missing_folder_is_one_line(tmp_path):
 
     assert done.returncode == 1
     assert done.stdout == ""
-    assert done.stderr.strip().splitlines() == [f"physics_reality: {tmp_path / 'none'}: no such folder"]
+    assert done.stderr.strip().splitlines() == [
+        f"python -m benchmarks.physics_reality: {tmp_path / 'none'}: no such folder"
+    ]

@@ -1,4 +1,4 @@
-"""When the goal counts as met."""
+"""When the goal is reached."""
 
 import pytest
 
@@ -9,7 +9,7 @@ from benchmarks.time_to_quality import is_reached
     ("returned", "error", "reached"),
     [("0.81", "0.31", True), ("0.80", "0.20", False), ("0.95", "0.32", False), ("0.0", "", False)],
 )
-def test_the_goal_is_both_figures_at_once(returned, error, reached):
+def test_the_goal_is_reached_if_both_figures_are(returned, error, reached):
     row = {"return_rate": returned, "target_error_mean": error}
 
     assert is_reached(row, 0.81, 0.31) is reached

@@ -43,7 +43,7 @@ def make_rollout(**changes: Any) -> Rollout:
         actor="actor-0",
         incarnation=3,
         sequence=11,
-        contract_hash="c0ffee",
+        training_hash="c0ffee",
         obs=block(T, B, D),
         actions=block(T, B, 7),
         log_mu=block(T, B),
@@ -98,8 +98,8 @@ EXAMPLES: tuple[Any, ...] = (
         rallies=np.arange(22, dtype="<f8").reshape(2, 11),
         seeds=np.array([1, 2**64 - 1], "<u8"),
         candidates=7,
-        preset="paper",
-        noise="standard",
+        launch="paper",
+        randomization="standard",
     ),
     RallyRequest(shard=1, block=2),
     PolicySnapshot(
@@ -111,6 +111,7 @@ EXAMPLES: tuple[Any, ...] = (
         epoch=12,
         frames=10**9,
         contract_hash="c0ffee",
+        training_hash="7ea",
         weights=bytes(range(256)),
         obs_mean=np.zeros(D, "<f8"),
         obs_var=np.ones(D, "<f8"),
@@ -133,8 +134,8 @@ EXAMPLES: tuple[Any, ...] = (
         leaving=False,
     ),
     Status("actor", "actor-0", 3, 1.8e9, "playing", {"frames": 5.0}, {"lag": 1.0}),
-    Control(Command.PAUSE),
-    ControlReply(ok=True, state="paused", reason=""),
+    Control(Command.DRAIN),
+    ControlReply(ok=True, state="draining", reason=""),
 )
 
 assert {type(example) for example in EXAMPLES} == set(MESSAGES), "a message without an example"

@@ -40,7 +40,7 @@ def sealed(body: bytes) -> bytes:
 
 
 def with_field(message: Any, field: str, raw: Any) -> bytes:
-    """The bytes of ``message`` with one field replaced behind the codec's back."""
+    """Return the bytes of ``message`` with ``raw`` in the place of one field, without the codec's checks."""
     kind, version, fields = msgpack.unpackb(encode(message)[12:])
     fields[field] = raw
     return sealed(msgpack.packb([kind, version, fields]))
@@ -109,7 +109,10 @@ def test_a_rollout_without_episodes_or_truncations_is_fine():
         (sealed(b"\x91" * 3000), "the body is not msgpack"),
         (sealed(msgpack.packb([1, 2])), r"not \[type, version, fields\]"),
         (sealed(msgpack.packb(["Spam", 1, {}])), "got a message of type 'Spam'; allowed here: Verdict"),
-        (sealed(msgpack.packb(["Verdict", 2, {}])), "version 2; this side speaks 1"),
+        (
+            sealed(msgpack.packb(["Verdict", 2, {}])),
+            "Verdict: version 2; allowed: 1: run the same release everywhere",
+        ),
         (sealed(msgpack.packb(["Verdict", True, {}])), "version True"),
         (sealed(msgpack.packb(["Verdict", 1, {"kind": "busy", "spam": 1}])), "missing.*first.*unknown.*spam"),
         (with_field(make_verdict(), "kind", "maybe"), "Verdict.kind: 'maybe'; allowed: accepted, "),
@@ -171,7 +174,7 @@ def test_either_of_two_types_is_read_and_a_third_is_refused():
         decode_one_of(encode(StageLog(())), (Control, Verdict))
 
 
-def test_an_oversize_message_is_refused_before_it_is_looked_at():
+def test_an_oversize_message_is_refused_before_it_is_read():
     with pytest.raises(DecodeError, match="101 bytes; allowed: up to 100"):
         decode(b"x" * 101, Verdict, limit_bytes=100)
 
@@ -192,13 +195,13 @@ def test_a_nested_message_is_checked_like_any_other():
         decode(encode(StageLog((make_stage(1), make_stage(1)))), StageLog)
 
 
-def test_an_actor_may_number_its_rollouts_for_longer_than_any_machine_lasts():
+def test_the_sequence_numbers_of_an_actor_last_for_a_century():
     a_century = 100 * 366 * 86_400 * 1000  # at a thousand a second
 
     assert decode(encode(make_rollout(sequence=a_century)), Rollout).sequence == a_century
 
 
-def test_who_sent_a_bad_rollout_can_still_be_told():
+def test_the_sender_of_a_bad_rollout_can_still_be_read():
     payload = with_field(make_rollout(), "obs", raw_array(BAD_OBS))
 
     assert salvage(payload, Rollout, ("actor", "sequence")) == {"actor": "actor-0", "sequence": 11}
@@ -215,7 +218,7 @@ def test_who_sent_a_bad_rollout_can_still_be_told():
         (make_verdict(credit_limit=2**70), "Verdict"),
     ],
 )
-def test_a_message_that_breaks_its_own_declaration_is_not_sent(message, error):
+def test_a_message_that_differs_from_its_declaration_is_not_encoded(message, error):
     with pytest.raises(EncodeError, match=error):
         encode(message)
 
@@ -244,7 +247,7 @@ def test_flipped_bytes_raise_nothing_but_a_decode_error(message, flips, reseal):
         decode(damaged, type(message))
     except DecodeError:
         return
-    # only what was sealed again, or not changed at all, may pass
+    # only bytes with a new checksum, or unchanged bytes, may pass
     assert reseal or damaged == encode(message)
 
 

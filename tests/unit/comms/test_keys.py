@@ -19,12 +19,12 @@ KEYS = Keys("night-1")
         (KEYS.status("learner", "l"), "topspin/v1/night-1/status/learner/l"),
     ],
 )
-def test_keys_are_what_the_documents_say(key, text):
+def test_keys_are_as_documented(key, text):
     assert key == text
 
 
 @pytest.mark.parametrize("run", ["", "a/b", "*", "a*", "a?", "a#", "$a", "@a", "ä", "a b", ".a", "x" * 65])
-def test_a_run_that_cannot_stand_in_a_key_is_refused(run):
+def test_a_run_name_that_cannot_be_part_of_a_key_is_refused(run):
     with pytest.raises(KeyPartError, match=r"run .* can't stand in a key; allowed: 1 to 64 letters"):
         Keys(run)
 
@@ -43,14 +43,14 @@ def test_bad_roles_ids_and_numbers_are_refused():
     st.from_regex(r"\A[a-z0-9]{1,9}\Z"),
     st.integers(0, 2**62),
 )
-def test_a_liveliness_key_tells_whose_it_is(role, id_, incarnation):
+def test_a_liveliness_key_names_its_member(role, id_, incarnation):
     assert KEYS.member(KEYS.alive(role, id_, incarnation)) == Member(role, id_, incarnation)
 
 
 @pytest.mark.parametrize(
     "key", ["", "topspin/v1/other/alive/actor/a/1", KEYS.policy(), f"{KEYS.alive('actor', 'a', 1)}/x"]
 )
-def test_a_key_that_is_no_liveliness_key_is_refused(key):
+def test_a_key_that_is_not_a_liveliness_key_is_refused(key):
     with pytest.raises(KeyPartError, match="is not topspin/v1/night-1/alive/"):
         KEYS.member(key)
 
@@ -73,6 +73,6 @@ def test_wildcards_stand_for_one_or_for_any_number_of_chunks(key_expr, key, want
     assert matches(key_expr, key) == wanted
 
 
-def test_the_expressions_for_everybody_match_every_member():
+def test_the_expressions_for_all_members_match_every_member():
     assert matches(KEYS.every_alive(), KEYS.alive("actor", "a", 1))
     assert matches(KEYS.every_status(), KEYS.status("actor", "a"))

@@ -1,4 +1,4 @@
-"""What arrives when nobody takes it any more."""
+"""Messages that arrive at a closed mailbox, and requests that arrive at a closed server."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from common.comms.transport import Bell, Mailbox, Request, Server
 
 
 @pytest.mark.parametrize("keep", ["newest", "oldest"])
-def test_a_closed_mailbox_hands_over_what_waited_and_takes_nothing_in(keep):
+def test_a_closed_mailbox_returns_its_content_and_accepts_nothing(keep):
     mailbox: Mailbox[int] = Mailbox(Bell(), 4, keep)
     mailbox.put(1)
     mailbox.put(2)
@@ -18,8 +18,8 @@ def test_a_closed_mailbox_hands_over_what_waited_and_takes_nothing_in(keep):
     assert mailbox.dropped == 0
 
 
-def test_a_request_that_arrives_as_its_server_closes_is_turned_away_or_refused():
-    """Zenoh's threads may still deliver while, and after, a queryable is undeclared."""
+def test_a_request_that_arrives_while_its_server_closes_is_refused():
+    """Zenoh's threads may still deliver requests while a queryable is undeclared, and after it."""
     inbox: Mailbox[int] = Mailbox(Bell(), 4, keep="oldest")
     answers = []
     server = Server(inbox, lambda raw: Request("key", b"", answers.append), lambda: inbox.put(1))

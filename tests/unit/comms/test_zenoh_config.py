@@ -6,7 +6,7 @@ from common.comms.zenoh_config import ZenohConfig, session_settings
 FILES = {"tls_ca": "ca.pem", "tls_certificate": "learner.pem", "tls_key": "learner.key"}
 
 
-def test_only_the_hub_listens_and_only_clients_dial_it():
+def test_only_the_hub_listens_and_only_clients_connect_to_it():
     hub = session_settings(ZenohConfig(mode="hub", peers=("tcp/site:7447",)), attempt_s=2.0)
     client = session_settings(ZenohConfig(), attempt_s=2.0)
 
@@ -22,7 +22,7 @@ def test_only_the_hub_listens_and_only_clients_dial_it():
     )
 
 
-def test_what_corrupted_or_exposed_something_is_off():
+def test_features_that_corrupt_or_expose_data_are_off():
     settings = session_settings(ZenohConfig(), attempt_s=2.0)
 
     for path in (
@@ -34,7 +34,7 @@ def test_what_corrupted_or_exposed_something_is_off():
         assert settings[path] is False
 
 
-def test_tls_certificates_are_needed_with_a_tls_endpoint_and_only_there():
+def test_a_tls_endpoint_and_only_that_needs_certificates():
     settings = session_settings(ZenohConfig(endpoint="tls/site:7447", **FILES), attempt_s=2.0)
 
     assert settings["transport/link/protocols"] == ["tls"]

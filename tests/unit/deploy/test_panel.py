@@ -36,15 +36,15 @@ def full_view():
     return view
 
 
-def test_it_is_drawn_before_anything_is_heard():
+def test_it_is_drawn_before_the_first_heartbeat():
     text = shown(View("night"))
 
     assert "Topspin night" in text
     assert "-:--" in text
-    assert "reward -" in text  # and not 0.0, which would be one
+    assert "reward -" in text  # and not 0.0, which would be a value
 
 
-def test_it_shows_where_the_run_stands():
+def test_it_shows_the_state_of_the_run():
     text = shown(full_view())
 
     for part in (
@@ -63,14 +63,14 @@ def test_it_shows_where_the_run_stands():
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
-def test_names_are_shown_as_they_are_not_read_as_markup():
+def test_names_are_shown_as_text_and_not_read_as_markup():
     view = View("night")
     view.hear(make_status("actor", "[/red]", state="[bold"), 1.0)
 
     assert "actor-[/red]" in shown(view)
 
 
-def test_the_budget_that_ends_first_decides_what_is_left():
+def test_the_budget_that_ends_first_decides_the_time_left():
     view = full_view()
 
     assert share_done(view) == 0.5  # 300 s of 10 min; 12 of 100 epochs

@@ -1,4 +1,4 @@
-"""The kernels' own kinematics against MuJoCo's, over random poses and motions of the robot."""
+"""The kernels' kinematics against MuJoCo's, for random poses and motions of the robot."""
 
 import mujoco
 import numpy as np
@@ -10,7 +10,7 @@ from common.physics.constants import TABLE_HALF_LENGTH, TABLE_HALF_WIDTH, TABLE_
 
 MODEL = load_model()
 RANGES = np.array(MODEL.jnt_range)
-EXACT = {"rtol": 0, "atol": 1e-12}  # the same rigid chain in another order of rounding
+EXACT = {"rtol": 0, "atol": 1e-12}  # the same rigid chain, rounded in another order
 
 
 def poses(count: int, seed: int = 0) -> np.ndarray:
@@ -29,7 +29,7 @@ def mujoco_at(q: np.ndarray, qd: np.ndarray | None = None) -> mujoco.MjData:
     return data
 
 
-def test_the_rackets_centre_and_axes_are_mujocos():
+def test_the_rackets_centre_and_axes_agree_with_mujoco():
     for q in poses(200):
         site = mujoco_at(q).site(RACKET_BODY)
         pose = arm.racket_pose(tuple(q))
@@ -40,7 +40,7 @@ def test_the_rackets_centre_and_axes_are_mujocos():
         )
 
 
-def test_the_quaternion_is_that_of_the_rackets_axes_with_w_not_negative():
+def test_the_quaternion_has_the_rackets_axes_and_w_is_not_negative():
     for q in poses(200):
         matrix, quaternion = np.empty(9), np.array(arm.racket_quaternion(tuple(q)))
         mujoco.mju_quat2Mat(matrix, quaternion)
@@ -51,7 +51,7 @@ def test_the_quaternion_is_that_of_the_rackets_axes_with_w_not_negative():
         np.testing.assert_allclose(matrix.reshape(3, 3), np.column_stack(pose[1:]), **EXACT)
 
 
-def test_the_rackets_velocities_are_mujocos():
+def test_the_rackets_velocities_agree_with_mujoco():
     for q, qd in zip(poses(200), rates(200), strict=True):
         twist = np.empty(6)
         body = MODEL.body(RACKET_BODY).id
@@ -62,7 +62,7 @@ def test_the_rackets_velocities_are_mujocos():
         np.testing.assert_allclose(velocity, twist[3:], rtol=0, atol=1e-11)
 
 
-def test_the_links_ends_are_mujocos():
+def test_the_ends_of_the_links_agree_with_mujoco():
     for q in poses(100):
         data = mujoco_at(q)
         shoulder, elbow, wrist, handle, centre = arm.links(tuple(q))
@@ -84,11 +84,11 @@ def test_the_links_ends_are_mujocos():
         ("racket", arm.RACKET_RADIUS),
     ],
 )
-def test_radii_are_the_models(geom, radius):
+def test_the_radii_agree_with_the_model(geom, radius):
     assert MODEL.geom(geom).size[0] == radius
 
 
-def test_blade_and_beam_are_the_models():
+def test_blade_and_beam_agree_with_the_model():
     beam = MODEL.geom("beam")
 
     assert MODEL.geom("racket").size[1] == arm.RACKET_HALF_THICKNESS
@@ -97,22 +97,22 @@ def test_blade_and_beam_are_the_models():
     np.testing.assert_allclose(MODEL.body("beam").pos, [arm.RAIL_HOME_X, 0.0, arm.BEAM_Z])
 
 
-def test_the_table_of_the_simulator_is_the_balls():
+def test_the_simulators_table_agrees_with_the_balls_table():
     table = MODEL.geom("table")
 
     np.testing.assert_allclose(2 * table.size, [2 * TABLE_HALF_LENGTH, 2 * TABLE_HALF_WIDTH, TABLE_THICKNESS])
-    assert table.pos[2] == -table.size[2]  # its top is where heights begin
+    assert table.pos[2] == -table.size[2]  # its top is at height 0
 
 
-def test_a_ball_beside_a_link_is_as_far_from_it_as_mujoco_says():
-    """The gap to upper arm and forearm, against mj_geomDistance to a sphere of the ball's size."""
+def test_the_gap_to_a_link_is_not_larger_than_by_mujocos_geoms():
+    """The gap to upper arm and forearm, against the distance to the capsules of MuJoCo's model."""
     rng = np.random.default_rng(2)
     for q in poses(50):
         data = mujoco_at(q)
         _, elbow, wrist, _, centre = arm.links(tuple(q))
         ball = np.array(elbow) + rng.uniform(-0.15, 0.15, 3)
         names = ("upper_arm", "forearm")
-        # the capsules' axes are the geoms' z axes; distance of the ball's centre from each segment
+        # a capsule's axis is its geom's z axis: distance of the ball's centre from this segment
         gaps = []
         for name in names:
             axis = data.geom(name).xmat.reshape(3, 3)[:, 2]
@@ -121,7 +121,7 @@ def test_a_ball_beside_a_link_is_as_far_from_it_as_mujoco_says():
             gaps.append(np.linalg.norm(ball - data.geom(name).xpos - along * axis) - radius - 0.02)
         gap, _ = touch.body_gap(tuple(ball), tuple(q))
 
-        # other parts may be nearer: wrist, column, beam
+        # another part may be nearer: wrist, column or beam
         assert gap <= min(gaps) + 1e-12
         assert touch.robot_gap_bound(tuple(ball), tuple(q)) <= gap + 1e-12
         assert np.linalg.norm(np.subtract(centre, wrist)) == pytest.approx(arm.RACKET_REACH)
@@ -139,7 +139,7 @@ def test_no_point_of_the_robot_moves_faster_than_the_bound():
 
 
 def robot_points(q: arm.Joints) -> np.ndarray:
-    """Return points of arm and racket: joints, the blade's rim and its faces' rims."""
+    """Return points of arm and racket: joints, the rim of the blade and of its face."""
     pose = arm.racket_pose(q)
     angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     rim = np.cos(angles)[:, None] * np.array(pose.side) + np.sin(angles)[:, None] * np.array(pose.up)
@@ -148,7 +148,7 @@ def robot_points(q: arm.Joints) -> np.ndarray:
     return np.concatenate([np.array(arm.links(q)), blade, face])
 
 
-def test_between_its_time_steps_the_robot_moves_evenly_at_the_rate_it_is_said_to():
+def test_between_its_time_steps_the_robot_moves_uniformly_at_its_joint_rates():
     path = poses(3)
     step = 0.004
     for moment in (0.001, 0.0055):
@@ -157,7 +157,7 @@ def test_between_its_time_steps_the_robot_moves_evenly_at_the_rate_it_is_said_to
         np.testing.assert_allclose((late - early) / 2e-6, arm.joint_rates_at(path, moment, step), rtol=1e-6)
 
 
-def test_a_points_velocity_is_that_of_the_rigid_racket():
+def test_the_velocity_of_a_point_is_that_of_the_rigid_racket():
     q, qd = poses(1)[0], rates(1)[0]
     pose = arm.racket_pose(tuple(q))
     velocity, angular = arm.racket_motion(tuple(q), tuple(qd))

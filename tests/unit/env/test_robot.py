@@ -1,4 +1,4 @@
-"""The MuJoCo robot: converged at its step, fast as stated, limited as stated, and pushed by the ball."""
+"""The MuJoCo robot: its time step is converged, its speeds and limits are as stated, and the ball pushes it."""
 
 import logging
 
@@ -17,19 +17,19 @@ from common.env.robot import (
     load_model,
 )
 from common.physics.arm import racket_motion, racket_pose, racket_quaternion
-from common.rally.noise import PROFILES
+from common.task.randomization import PROFILES
 
-FINE_STEP = 0.00025  # s: sixteen times finer than the robot's
+FINE_STEP = 0.00025  # [s] a sixteenth of the robot's
 HOME = home_action().astype(np.float64)
 STILL = np.zeros((1, 7))
 ONE = np.zeros(1, np.int64)
 
 
 def make_strokes(count: int = 64, steps: int = 20, seed: int = 0) -> np.ndarray:
-    """Return smooth full strokes as a policy plays them: (steps, count, 7) actions at 50 Hz.
+    """Return smooth full strokes as of a policy: (steps, count, 7) actions at 50 Hz.
 
-    In 0.2 s back by up to a third of each joint's range, in 0.2 s forward as far beyond home, along minimum-jerk
-    curves: the racket reaches 4 m/s.
+    In 0.2 s each joint moves back by up to a third of its range, then in 0.2 s forward as far beyond home, on
+    minimum-jerk curves. The racket reaches 4 m/s.
     """
     rng = np.random.default_rng(seed)
     back, front = HOME + 0.35 * rng.uniform(-1, 1, (2, count, 7)) * [1, 1, 0.4, 0.4, 0.4, 0.5, 0.4]
@@ -39,7 +39,7 @@ def make_strokes(count: int = 64, steps: int = 20, seed: int = 0) -> np.ndarray:
 
 
 def racket_errors(actions: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return how far [m] and how much [rad] the racket differs from a robot of FINE_STEP, at every control step."""
+    """Return distance [m] and angle [rad] between the rackets with ``step`` and FINE_STEP, at every control step."""
     coarse, fine = (RobotBatch(actions.shape[1], step=h) for h in (step, FINE_STEP))
     distances, turns = [], []
     for action in actions:
@@ -59,7 +59,7 @@ def racket_speed(robot: RobotBatch) -> float:
 
 
 def drive(robot: RobotBatch, action: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
-    """Return each joint's greatest speed and the racket's under a constant action."""
+    """Return the largest speed of each joint and of the racket under a constant action."""
     joints, racket = np.zeros(7), 0.0
     for _ in range(steps):
         robot.step(action[None])
@@ -71,8 +71,9 @@ def drive(robot: RobotBatch, action: np.ndarray, steps: int) -> tuple[np.ndarray
 def test_the_time_step_is_converged_over_full_strokes():
     """4 ms against 0.25 ms: racket mean 1.4 mm and 4 mrad, at most 5.1 mm and 27 mrad (measured).
 
-    A ball is 40 mm across, the camera's noise is 3 mm, and the error is the same in training and evaluation: a
-    policy can't see it. Commands that jump through half a range, so that every drive saturates, come to mean 5 mm.
+    The ball's diameter is 40 mm and the measurement noise is 3 mm. The error is the same in training and evaluation, so
+    a policy can't observe it. Targets that jump by half a range, so that every drive saturates, have a mean error of
+    5 mm.
     """
     distances, turns = racket_errors(make_strokes(), MUJOCO_STEP)
 
@@ -86,7 +87,7 @@ def test_the_error_of_the_time_step_falls_in_proportion_to_it():
     strokes = make_strokes(count=16)
     whole, half = (racket_errors(strokes, step)[0].mean() for step in (0.004, 0.002))
 
-    # first order against a reference of h/16: (4 - .25)/(2 - .25) = 2.1
+    # first order, against a reference of h/16: (4 - 0.25)/(2 - 0.25) = 2.1
     assert whole / half == pytest.approx(2.1, abs=0.5)
 
 
@@ -98,7 +99,7 @@ def test_the_racket_reaches_8_to_9_m_per_s():
     assert racket > 8.0
 
 
-def test_the_robot_gets_three_quarters_of_a_metre_sideways_in_four_tenths_of_a_second():
+def test_the_robot_moves_70_cm_sideways_in_0_4_s():
     robot = RobotBatch(1)
     aside = HOME.copy()
     aside[1] = 0.9
@@ -107,9 +108,11 @@ def test_the_robot_gets_three_quarters_of_a_metre_sideways_in_four_tenths_of_a_s
     assert abs(robot.joint_pos[0, 1]) > 0.70
 
 
-def test_joints_stay_within_their_ranges_under_the_widest_commands():
-    """MuJoCo's limits are springs: flung into its stop by bang-bang commands a joint overshoots (measured:
-    4 mm, and 0.19 rad of the pitch, which carries the whole arm at 13 rad/s)."""
+def test_joints_overshoot_their_ranges_by_little_under_the_widest_targets():
+    """MuJoCo's joint limits are springs. A joint whose target jumps from end to end overshoots its stop.
+
+    Measured: 4 mm, and 0.19 rad of the pitch, which carries the whole arm at 13 rad/s.
+    """
     overshoot = np.array([0.01, 0.01, 0.25, 0.25, 0.25, 0.25, 0.25])
     rng = np.random.default_rng(0)
     robot = RobotBatch(64)
@@ -124,8 +127,8 @@ def test_joints_stay_within_their_ranges_under_the_widest_commands():
 
 
 @pytest.mark.parametrize("joint", range(7), ids=JOINTS)
-def test_usst_joints_keep_to_the_published_speeds(joint):
-    """Each alone, to both stops; 10 %: gravity and the arm beyond a joint may push where the drive can't."""
+def test_usst_joints_exceed_the_published_speeds_by_at_most_10_percent(joint):
+    """Each joint alone, to both stops. Gravity and the arm beyond a joint may push it faster than its drive can."""
     for side in (-1.0, 1.0):
         robot = RobotBatch(1, "usst")
         action = HOME.copy()
@@ -135,7 +138,7 @@ def test_usst_joints_keep_to_the_published_speeds(joint):
         assert joints[joint] <= 1.10 * USST_SPEED_LIMITS[joint]
 
 
-def test_usst_is_slower_than_rails_in_no_load_speed_and_equal_otherwise():
+def test_usst_differs_from_rails_only_in_its_lower_no_load_speeds():
     ours, theirs = load_model("rails"), load_model("usst")
 
     np.testing.assert_allclose(theirs.actuator_forcerange[:, 1] / theirs.dof_damping, USST_SPEED_LIMITS)
@@ -152,8 +155,8 @@ def test_forces_stay_within_the_actuators_limits():
 
 
 @pytest.mark.parametrize("control_rate_hz", [50, 200])
-def test_an_impulse_arrives_at_the_racket_over_one_control_step(control_rate_hz):
-    """Without drives, friction of the joints and with gravity in both: M dv = J^T impulse."""
+def test_the_racket_receives_an_impulse_within_one_control_step(control_rate_hz):
+    """Two robots without drives and joint damping, one with the impulse: M dv = J^T impulse."""
     impulse = np.array([[-0.03, 0.01, 0.02, 1e-4, -5e-4, 2e-4]])
     pushed, free = (RobotBatch(1, control_rate_hz=control_rate_hz) for _ in range(2))
     for robot in (pushed, free):
@@ -169,14 +172,14 @@ def test_an_impulse_arrives_at_the_racket_over_one_control_step(control_rate_hz)
         robot.step(HOME[None])
     dv = pushed.joint_vel[0] - free.joint_vel[0]
 
-    # the arm falls and turns a little meanwhile: at 50 Hz M and J change by some percent
+    # the arm falls and turns a little during the step: at 50 Hz M and J change by a few percent
     scale = np.abs(momentum).max()
     np.testing.assert_allclose(
         inertia @ dv, momentum, rtol=0, atol=scale * (0.06 if control_rate_hz == 50 else 0.01)
     )
 
 
-def test_an_impulse_is_given_once():
+def test_an_impulse_acts_only_in_the_next_control_step():
     impulse = np.array([[-0.03, 0.0, 0.01, 0.0, 0.0, 0.0]])
     robot = RobotBatch(1)
     wrench = robot.batch.bind("xfrc_applied")[0, robot.model.body(RACKET_BODY).id]
@@ -189,15 +192,15 @@ def test_an_impulse_is_given_once():
     np.testing.assert_array_equal(wrench, 0.0)
 
 
-def test_home_is_held():
+def test_the_home_action_holds_the_home_pose():
     robot = RobotBatch(1)
     drive(robot, HOME, steps=50)
 
-    # kp / gravity: the wrist sags by its torque over 80 Nm/rad
+    # gravity: the wrist sags by its torque divided by 80 Nm/rad
     np.testing.assert_allclose(robot.joint_pos[0], robot.home, atol=0.02)
 
 
-def test_a_higher_gain_tracks_closer():
+def test_a_drive_with_a_higher_gain_is_closer_to_its_target():
     stiff, soft = RobotBatch(1), RobotBatch(1)
     soft.set_gains(ONE, np.array([[[0.5] * 7, [1.0] * 7, [1.0] * 7]]), np.zeros(1))
     action = HOME + 0.05
@@ -209,27 +212,27 @@ def test_a_higher_gain_tracks_closer():
 
 
 @pytest.mark.parametrize("control_rate_hz", [50, 200])
-def test_an_action_acts_a_latency_late(control_rate_hz):
+def test_an_action_acts_one_latency_late(control_rate_hz):
     """Also where the latency is longer than the control period, as at 200 Hz."""
     prompt, late = (RobotBatch(1, control_rate_hz=control_rate_hz) for _ in range(2))
     late.set_gains(ONE, np.ones((1, 3, 7)), np.array([0.020]))
     delay = round(0.020 * control_rate_hz)
     home = np.tile(late.home_action, (delay, 1, 1))
     actions = late.home_action + 0.1 * np.random.default_rng(0).standard_normal((12, 1, 7))
-    for told, acted in zip(actions, np.concatenate([home, actions]), strict=False):
-        late.step(told)
-        prompt.step(acted)
+    for given, acting in zip(actions, np.concatenate([home, actions]), strict=False):
+        late.step(given)
+        prompt.step(acting)
 
     np.testing.assert_array_equal(late.joint_pos, prompt.joint_pos)
 
 
-def test_targets_are_remembered_as_long_as_any_profile_may_be_late():
-    assert max(noise.action_latency[1] for noise in PROFILES.values()) <= MAX_ACTION_LATENCY
+def test_targets_are_kept_as_long_as_the_longest_action_latency():
+    assert max(profile.action_latency[1] for profile in PROFILES.values()) <= MAX_ACTION_LATENCY
 
 
 @pytest.mark.parametrize("broken", [np.nan, 1e12])
-def test_a_robot_that_mujoco_gives_up_on_goes_home(broken, caplog, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log file of its warnings
+def test_a_robot_whose_simulation_mujoco_resets_goes_home(broken, caplog, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log file of its warnings
     robot = RobotBatch(3)
     robot.step(np.tile(HOME, (3, 1)))
     robot.joint_vel[1, 2] = broken
@@ -245,7 +248,7 @@ def test_a_robot_that_mujoco_gives_up_on_goes_home(broken, caplog, tmp_path, mon
     assert robot.faulty.size == 0
 
 
-def test_a_control_period_that_the_step_does_not_divide_is_refused():
+def test_a_control_period_that_is_not_a_multiple_of_the_step_is_refused():
     with pytest.raises(
         ValueError, match=r"control period 0.02 s is not a multiple of the MuJoCo step 0.003 s"
     ):

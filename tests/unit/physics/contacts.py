@@ -1,4 +1,4 @@
-"""Random contacts for the property tests, and the mechanics they are judged by (written again, in numpy)."""
+"""Random contacts for the property tests, and the mechanics that they are compared with (written again in numpy)."""
 
 import math
 from typing import NamedTuple
@@ -53,7 +53,7 @@ def mirrored(a: Vec) -> Vec:
 
 
 def mirrored_spin(a: Vec) -> Vec:
-    """Return the image of a spin: a pseudo-vector keeps the component across the mirror."""
+    """Return the image of a spin: the component of a pseudo-vector across the mirror stays."""
     return (-a[0], a[1], -a[2])
 
 

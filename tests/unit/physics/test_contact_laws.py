@@ -1,4 +1,4 @@
-"""Mechanics that both bounces must keep, whatever their coefficients."""
+"""Mechanics that both bounces must satisfy for any coefficients."""
 
 import math
 
@@ -42,7 +42,7 @@ def on_table(contact: Contact, restitution0: float = 0.98, friction: float = 0.2
 
 
 def on_racket(contact: Contact, rubber: Rubber) -> tuple[Vec, Vec]:
-    return racket_bounce(contact.vel, contact.spin, contact.normal, contact.surface_vel, *rubber)
+    return racket_bounce(contact.vel, contact.spin, contact.normal, contact.surface_vel, rubber)
 
 
 def expect_energy_ledger(contact: Contact, vel: Vec, spin: Vec, spin_loss: float) -> None:
@@ -83,14 +83,16 @@ def expect_momentum_balance(contact: Contact, vel: Vec, spin: Vec) -> None:
 
 @given(contacts(moving=False), table_restitutions, table_frictions)
 @example(GRAZING, 0.98, 0.25)
-def test_the_table_keeps_the_energy_ledger(contact: Contact, restitution0: float, friction: float):
+def test_the_table_conserves_energy_with_its_losses(contact: Contact, restitution0: float, friction: float):
     vel, spin = on_table(contact, restitution0, friction)
 
     expect_energy_ledger(contact, vel, spin, spin_loss=0.0)
 
 
 @given(contacts(), rubbers)
-def test_the_racket_keeps_the_energy_ledger_in_the_frame_of_its_surface(contact: Contact, rubber: Rubber):
+def test_the_racket_conserves_energy_with_its_losses_in_the_frame_of_its_surface(
+    contact: Contact, rubber: Rubber
+):
     vel, spin = on_racket(contact, rubber)
 
     expect_energy_ledger(contact, vel, spin, rubber.spin_loss)
@@ -114,7 +116,7 @@ def test_the_racket_keeps_linear_and_angular_momentum(contact: Contact, rubber: 
 
 
 @given(contacts(), rubbers)
-def test_a_bounce_on_a_moving_racket_is_the_bounce_on_a_still_one_seen_from_the_table(
+def test_a_bounce_on_a_moving_racket_is_the_bounce_on_a_racket_at_rest_in_its_frame(
     contact: Contact, rubber: Rubber
 ):
     still = Contact(
@@ -154,7 +156,7 @@ def test_bounces_on_the_table_are_mirror_symmetric(contact: Contact):
 
 @given(contacts(moving=False))
 def test_the_table_agrees_with_the_passive_hard_rubber(contact: Contact):
-    """One law, two doors: a rubber with alpha = 2/5, Coulomb friction and no drill is a table."""
+    """A rubber with alpha = 2/5, Coulomb friction and no spin loss is a table."""
     table_like = Rubber(0.98, 0.02, 0.4, 0.0, 0.25)
 
     np.testing.assert_allclose(on_table(contact), on_racket(contact, table_like), rtol=1e-12, atol=1e-12)

@@ -11,6 +11,7 @@ from common.physics.constants import AIR_FACTOR, AIR_VOLUME_FACTOR, BALL_RADIUS,
 from common.physics.flight import (
     FULL,
     SIMPLE,
+    Air,
     acceleration,
     flight_step,
     full_drag,
@@ -27,13 +28,13 @@ factors = st.floats(0.5, 1.5)
 def accelerate(
     vel: Vec, spin: Vec = ORIGIN, drag: float = 1.0, lift: float = 1.0, model: int = SIMPLE
 ) -> Vec:
-    return acceleration(vel, spin, drag, lift, model)
+    return acceleration(vel, spin, Air(drag, lift, model))
 
 
 def fly(vel: Vec, spin: Vec, steps: int, h: float, model: int = SIMPLE, drag: float = 1.0, lift: float = 1.0):
     pos = ORIGIN
     for _ in range(steps):
-        pos, vel = flight_step(pos, vel, spin, h, drag, lift, model)
+        pos, vel = flight_step(pos, vel, spin, h, Air(drag, lift, model))
     return pos, vel
 
 
@@ -79,15 +80,15 @@ def test_topspin_dives_backspin_floats_and_sidespin_curves(model):
 @both_models
 @given(vectors(15.0), vectors(500.0), factors, factors)
 def test_flight_is_mirror_symmetric_bit_for_bit(model, vel, spin, drag, lift):
-    pos, end = flight_step(ORIGIN, vel, spin, GRID_STEP, drag, lift, model)
-    image = flight_step(ORIGIN, mirrored(vel), mirrored_spin(spin), GRID_STEP, drag, lift, model)
+    pos, end = flight_step(ORIGIN, vel, spin, GRID_STEP, Air(drag, lift, model))
+    image = flight_step(ORIGIN, mirrored(vel), mirrored_spin(spin), GRID_STEP, Air(drag, lift, model))
 
     assert image == (mirrored(pos), mirrored(end))
 
 
 @both_models
 @given(vectors(15.0), vectors(500.0), st.floats(-math.pi, math.pi))
-def test_flight_knows_no_horizontal_direction(model, vel, spin, angle):
+def test_flight_is_the_same_in_every_horizontal_direction(model, vel, spin, angle):
     c, s = math.cos(angle), math.sin(angle)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     turned = accelerate(tuple(R @ vel), tuple(R @ spin), model=model)
@@ -97,14 +98,14 @@ def test_flight_knows_no_horizontal_direction(model, vel, spin, angle):
 
 @both_models
 @given(vectors(15.0), vectors(500.0), factors, factors)
-def test_the_air_never_gives_energy(model, vel, spin, drag, lift):
+def test_the_air_never_adds_energy(model, vel, spin, drag, lift):
     a = np.add(accelerate(vel, spin, drag, lift, model), [0.0, 0.0, GRAVITY])
 
     assert a @ vel <= 1e-9
 
 
 @both_models
-def test_the_factors_scale_drag_and_lift_each(model):
+def test_each_factor_scales_drag_or_lift_alone(model):
     vel, spin = (-8.0, 1.0, 0.5), (30.0, -250.0, 60.0)
     still, drag, lift, both = (
         np.array(accelerate(vel, spin, d, m, model)) for d, m in ((0, 0), (1, 0), (0, 1), (1.1, 0.8))
@@ -142,7 +143,7 @@ def test_half_a_second_on_the_grid_is_exact_to_ten_micrometres(spin, model):
         (10.0, (0.75 + 0.62) / 2, 0.54),  # halfway between speeds, at the interpolated knot
         (10.0, 0.0, 0.48),
         (22.5, 0.84, 0.33),  # along the slope of the last two rows
-        (60.0, 0.84, 0.30),  # and no lower
+        (60.0, 0.84, 0.30),  # the lower limit
     ],
 )
 def test_full_drag_reproduces_the_published_knots(speed, spin_parameter, expected):
@@ -180,7 +181,7 @@ def test_the_full_model_is_continuous_in_speed():
             np.testing.assert_allclose(below, above, atol=1e-6)
 
 
-def test_a_vanishing_spin_leaves_the_full_model_with_the_drag_of_a_spinless_ball():
+def test_the_full_models_drag_at_a_vanishing_spin_is_that_of_a_ball_without_spin():
     spinless = accelerate((-7.5, 0.0, 0.0), model=FULL)
     almost = accelerate((-7.5, 0.0, 0.0), (0.0, 1e-9, 0.0), model=FULL)
 

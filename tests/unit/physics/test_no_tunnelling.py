@@ -1,4 +1,4 @@
-"""No ball passes through the racket, however thin, fast and tilted the meeting is."""
+"""No ball passes through the racket, also where the contact is thin, fast and tilted."""
 
 import math
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from common.physics import touch
 from common.physics.arm import RACKET_RADIUS, joints_at, racket_motion, racket_pose, speed_bound
 from common.physics.constants import GRAVITY, GRID_STEP
-from common.physics.flight import SIMPLE, flight_step
-from common.physics.fly import fly_step
+from common.physics.flight import SIMPLE, Air, flight_step
+from common.physics.fly import RobotPath, fly_step
 from common.physics.vec import Vec
 from tests.unit.physics.contacts import as_vec
 
@@ -21,7 +21,7 @@ ROBOT_ROWS = round(STEPS * GRID_STEP / ROBOT_STEP) + 1
 NO_SPIN = (0.0, 0.0, 0.0)
 
 
-class Meeting(NamedTuple):
+class Impact(NamedTuple):
     """A swing of the robot, and a ball whose centre would pass through the racket's disc at ``moment``."""
 
     trajectory: np.ndarray  # (ROBOT_ROWS, 7)
@@ -30,7 +30,7 @@ class Meeting(NamedTuple):
     moment: float  # s
 
 
-def make_meeting(
+def make_impact(
     q: tuple[float, ...],
     rates: tuple[float, ...] = (0.0,) * 7,
     speed: float = 20.0,
@@ -39,8 +39,8 @@ def make_meeting(
     radius: float = 0.0,
     angle: float = 0.0,
     moment: float = 0.015,
-) -> Meeting:
-    """Return a meeting without air, so that the ball's parabola can be run backwards.
+) -> Impact:
+    """Return an impact without air, so that the ball's parabola can be computed backwards.
 
     Args:
         q: Joints at the moment.
@@ -61,7 +61,7 @@ def make_meeting(
     along_face = math.cos(azimuth) * side + math.sin(azimuth) * up
     vel = speed * (math.sin(incidence) * along_face - math.cos(incidence) * normal)
     fall = np.array([0.0, 0.0, GRAVITY * moment])
-    return Meeting(
+    return Impact(
         np.array(q) + times[:, None] * swing,
         as_vec(aim - moment * (vel + fall / 2)),
         as_vec(vel + fall),
@@ -79,8 +79,8 @@ joints = st.tuples(
     st.floats(-2.1, 2.1),
     st.floats(-2.9, 2.9),
 )
-meetings = st.builds(
-    make_meeting,
+impacts = st.builds(
+    make_impact,
     q=joints,
     rates=st.tuples(*[st.floats(-4.0, 4.0)] * 2, *[st.floats(-25.0, 25.0)] * 5),
     speed=st.floats(5.0, 20.0),
@@ -94,14 +94,20 @@ HOME = (0.0, 0.0, 0.0, 1.0, 1.0, 1.1, 0.0)
 SMASH = (3.0, 0.0, 0.0, 20.0, 20.0, 20.0, 0.0)
 
 
-def fly(meeting: Meeting, trajectory: np.ndarray) -> tuple[Vec, float, int]:
+def fly(impact: Impact, trajectory: np.ndarray) -> tuple[Vec, float, int]:
     """Return position, time and touch at the end of the control period or at the first touch."""
-    pos, vel = meeting.pos, meeting.vel
+    pos, vel = impact.pos, impact.vel
     start = 0.0
     robot_speed = speed_bound(trajectory, ROBOT_STEP)
     for _ in range(STEPS):
         pos, vel, flown, what, _ = fly_step(
-            pos, vel, NO_SPIN, GRID_STEP, 0.0, 0.0, SIMPLE, trajectory, start, ROBOT_STEP, robot_speed
+            pos,
+            vel,
+            NO_SPIN,
+            GRID_STEP,
+            Air(0.0, 0.0, SIMPLE),
+            RobotPath(trajectory, ROBOT_STEP, robot_speed),
+            start,
         )
         start += flown
         if what != touch.NONE:
@@ -109,46 +115,46 @@ def fly(meeting: Meeting, trajectory: np.ndarray) -> tuple[Vec, float, int]:
     return pos, start, what
 
 
-def robot_gap(meeting: Meeting, pos: Vec, moment: float) -> float:
-    q = joints_at(meeting.trajectory, moment, ROBOT_STEP)
+def robot_gap(impact: Impact, pos: Vec, moment: float) -> float:
+    q = joints_at(impact.trajectory, moment, ROBOT_STEP)
     return min(touch.racket_gap(pos, racket_pose(q))[0], touch.body_gap(pos, q)[0])
 
 
-def starts_free(meeting: Meeting) -> bool:
-    still = min(gap(meeting.pos)[0] for gap in (touch.table_gap, touch.net_gap, touch.floor_gap))
-    return min(still, robot_gap(meeting, meeting.pos, 0.0)) > 0.0
+def starts_free(impact: Impact) -> bool:
+    still = min(gap(impact.pos)[0] for gap in (touch.table_gap, touch.net_gap, touch.floor_gap))
+    return min(still, robot_gap(impact, impact.pos, 0.0)) > 0.0
 
 
 @settings(max_examples=500)
-@given(meetings)
-@example(make_meeting(HOME, SMASH))
-@example(make_meeting(HOME, SMASH, incidence=1.4, radius=0.07))
-@example(make_meeting(HOME, incidence=math.pi, moment=0.010 + 1e-9))
-def test_a_ball_aimed_at_the_moving_racket_never_passes_through(meeting):
-    assume(starts_free(meeting))
-    pos, flown, what = fly(meeting, meeting.trajectory)
+@given(impacts)
+@example(make_impact(HOME, SMASH))
+@example(make_impact(HOME, SMASH, incidence=1.4, radius=0.07))
+@example(make_impact(HOME, incidence=math.pi, moment=0.010 + 1e-9))
+def test_a_ball_aimed_at_the_moving_racket_never_passes_through(impact):
+    assume(starts_free(impact))
+    pos, flown, what = fly(impact, impact.trajectory)
 
     assert what not in (touch.NONE, touch.OUT)
-    assert flown < meeting.moment
+    assert flown < impact.moment
     if what in (touch.RACKET, touch.BODY):
-        assert abs(robot_gap(meeting, pos, flown)) < 1e-6
+        assert abs(robot_gap(impact, pos, flown)) < 1e-6
 
 
 @settings(max_examples=200)
-@given(meetings)
-def test_nothing_is_entered_before_the_touch_that_is_reported(meeting):
-    assume(starts_free(meeting))
-    _, flown, _ = fly(meeting, meeting.trajectory)
+@given(impacts)
+def test_the_ball_overlaps_nothing_before_the_touch_that_is_reported(impact):
+    assume(starts_free(impact))
+    _, flown, _ = fly(impact, impact.trajectory)
     for moment in np.linspace(0.0, flown, 60, endpoint=False):
-        pos, _ = flight_step(meeting.pos, meeting.vel, NO_SPIN, float(moment), 0.0, 0.0, SIMPLE)
+        pos, _ = flight_step(impact.pos, impact.vel, NO_SPIN, float(moment), Air(0.0, 0.0, SIMPLE))
 
-        # a grazing contact may be passed over by 3 um
-        assert robot_gap(meeting, pos, float(moment)) > -5e-6
+        # a grazing contact of less than 3 um depth may be missed
+        assert robot_gap(impact, pos, float(moment)) > -5e-6
 
 
-@given(meetings)
-def test_a_robot_that_is_not_met_changes_no_bit_of_a_flight(meeting):
-    x, y, z = meeting.pos
-    missed = meeting._replace(pos=(x + 2.0, y, z + 2.0))
+@given(impacts)
+def test_a_robot_that_is_not_touched_changes_no_bit_of_a_flight(impact):
+    x, y, z = impact.pos
+    missed = impact._replace(pos=(x + 2.0, y, z + 2.0))
 
-    assert fly(missed, meeting.trajectory) == fly(missed, np.empty((0, 7)))
+    assert fly(missed, impact.trajectory) == fly(missed, np.empty((0, 7)))

@@ -1,15 +1,14 @@
 """The paper's collision equations (its eq. 2, signs corrected) and the table's law against resolved contacts.
 
-A free ball meets MuJoCo's own compliant table in steps of a microsecond. From the contact forces f_k and
-torques M_k about the centre of each step follow the paper's integrals as sums of discrete data:
+A free ball touches MuJoCo's own compliant table in steps of a microsecond. The contact forces f_k and torques M_k about
+the centre of each step give the paper's integrals as sums:
 
     J_f = sum f_k h,    J_M = sum M_k h,    W_f = sum f_k . ds_k,    W_M = sum M_k . dtheta_k
     m v = m u + J_f,    I w = I w_0 + J_M,    m v^2 + I w^2 = m u^2 + I w_0^2 + 2 W_f + 2 W_M
 
-They hold for any contact force, so they test the bookkeeping and not the ball. The table's law is tested by
-what a bounce does along the table: MuJoCo's friction is Coulomb's, given enough steps. Its convex friction
-cone also pushes sliding surfaces apart, so the restitution of a contact with slip is MuJoCo's own, .2 to 1.0,
-and the law is handed the one that came out.
+They hold for any contact force, so they test the sums and not the ball. The table's law is compared with the changes
+along the table: MuJoCo's friction is Coulomb's, given enough steps. Its convex friction cone also separates sliding
+surfaces, so the restitution of a contact with slip is MuJoCo's own (0.2 to 1.0), and the law gets that value.
 """
 
 from typing import NamedTuple
@@ -26,8 +25,8 @@ STEP = 1e-6  # s
 STIFFNESS = 15_000.0**2  # 1/s^2: a contact of 0.2 ms, 0.2 mm deep at 3 m/s
 FRICTION = 0.25
 
-# solref < 0: stiffness and damping per mass, given directly. The slip is damped within 5 us, as far as
-# Coulomb's limit lets it.
+# solref < 0: stiffness and damping per mass, given directly. The slip is damped within 5 us, up to
+# Coulomb's limit.
 MODEL = """
 <mujoco>
   <option timestep="{step}" gravity="0 0 0" cone="elliptic" tolerance="0" iterations="50"/>
@@ -141,8 +140,8 @@ def test_summed_contact_forces_satisfy_the_papers_corrected_equations(vel, spin)
 
 
 @every_bounce
-def test_the_velocity_after_follows_from_work_over_impulse_by_component(vel, spin):
-    """Eq. 2 solved for v: v_i = 2 W_i / J_i - u_i, wherever there is an impulse to divide by."""
+def test_the_velocity_after_follows_from_work_over_impulse_per_component(vel, spin):
+    """Eq. 2 solved for v: v_i = 2 W_i / J_i - u_i, where the impulse is not 0."""
     bounce = resolve(vel, spin)
     pushed = np.abs(bounce.J_f) > 1e-9
 
@@ -153,7 +152,7 @@ def test_the_velocity_after_follows_from_work_over_impulse_by_component(vel, spi
 
 
 def test_displacements_taken_at_the_end_of_a_step_miss_the_velocity():
-    """Why the midpoint: the end of the step overstates the work by sum f^2 h^2 / 2m."""
+    """The reason for the midpoint: the end of the step overstates the work by sum f^2 h^2 / 2m."""
     bounce = resolve(*BOUNCES["steep"])
     v_z = 2 * bounce.W_f_end[2] / bounce.J_f[2] - bounce.u[2]
 

@@ -1,4 +1,4 @@
-"""The racket's law against measured contacts (hand-copied samples; skipped where the recordings are not)."""
+"""Measured contacts compared with the racket's law (samples copied by hand). Skipped where the samples are missing."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def predicted(
     vel: np.ndarray, spin: np.ndarray, normal: tuple[float, float, float]
 ) -> tuple[np.ndarray, ...]:
     after = [
-        racket_bounce(tuple(map(float, v)), tuple(map(float, w)), normal, (0.0, 0.0, 0.0), *INVERTED)
+        racket_bounce(tuple(map(float, v)), tuple(map(float, w)), normal, (0.0, 0.0, 0.0), INVERTED)
         for v, w in zip(vel, spin, strict=True)
     ]
     return np.array([v for v, _ in after]), np.array([w for _, w in after])
@@ -38,7 +38,7 @@ def median_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_a_still_inverted_racket_is_predicted_within_the_spread_of_its_own_measurements():
-    """Gossard 2026, racket 1, in its plane: z is the normal; its own fits err by .44 m/s, 15 rad/s."""
+    """Gossard 2026, racket 1, in its plane: z is the normal; the errors of its own fits: 0.44 m/s and 15 rad/s."""
     rows = read_rows("gossard_racket01_sample.csv")
     zero = np.zeros(len(rows))
     _, wy_in, wy_out, vx_in, vz_in, vx_out, vz_out = rows.T
@@ -51,7 +51,7 @@ def test_a_still_inverted_racket_is_predicted_within_the_spread_of_its_own_measu
 
 
 def test_contacts_of_matches_are_predicted_within_the_spread_of_their_own_fit():
-    """Conti et al. 2026: racket frame, x is the normal, relative; their fits err by .79 m/s, 34 rad/s."""
+    """Conti et al. 2026: relative, racket frame, x is the normal; the errors of their fits: 0.79 m/s and 34 rad/s."""
     rows = read_rows("sony_racket_contacts_sample.csv")
     vel, spin = predicted(rows[:, 1:4], rows[:, 4:7], (1.0, 0.0, 0.0))
 

@@ -8,7 +8,7 @@ from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_d
 from common.policy.d2rl import D2RL
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network
-from common.rally.observation import PAPER_OBSERVATION, PRIVILEGED, size
+from common.task.observation import PAPER_OBSERVATION, PRIVILEGED, size
 
 PAPER_UNITS = (256, 128, 128, 64, 64, 32)
 
@@ -16,7 +16,7 @@ TRUTH = size(PRIVILEGED)
 
 
 def by_hand(trunk, obs):
-    """D2RL as its paper draws it, with plain matrix products."""
+    """D2RL as in its paper, with plain matrix products."""
     hidden = None
     for k, layer in enumerate(trunk.layers):
         seen = obs if k == 0 else np.concatenate((hidden, obs))
@@ -25,7 +25,7 @@ def by_hand(trunk, obs):
     return hidden
 
 
-def test_every_hidden_layer_after_the_first_sees_the_observation_again():
+def test_every_hidden_layer_after_the_first_takes_the_observation_again():
     torch.manual_seed(0)
     trunk = D2RL(37, PAPER_UNITS)
     obs = np.random.default_rng(0).normal(size=37)
@@ -50,13 +50,10 @@ def test_the_papers_trunk_has_its_published_number_of_parameters():
     assert count == 89_024
 
 
-@pytest.mark.parametrize(
-    ("trunks", "parameters"), [("shared", 89_024 + 264 + 7), ("separate", 2 * 89_024 + 264 + 7)]
-)
-def test_actor_and_critic_share_all_but_the_last_layers_or_nothing(trunks, parameters):
-    network = new_network(NetworkConfig(trunks=trunks))
+def test_actor_and_critic_share_all_but_the_last_layers():
+    network = new_network(NetworkConfig())
 
-    assert sum(p.numel() for p in network.parameters()) == parameters
+    assert sum(p.numel() for p in network.parameters()) == 89_024 + 264 + 7
 
 
 def test_training_starts_from_a_robot_that_holds_its_home_pose():
@@ -68,26 +65,26 @@ def test_training_starts_from_a_robot_that_holds_its_home_pose():
     assert mean.shape == (5, 7)
     assert value.shape == (5,)
     np.testing.assert_allclose(mean.detach().numpy(), np.tile(home, (5, 1)), atol=1e-3)
-    np.testing.assert_allclose(network.log_sigma.detach().numpy(), -1.6)
+    np.testing.assert_allclose(network.log_std.detach().numpy(), -1.6)
 
 
 def test_log_probability_entropy_and_divergence_are_the_gaussians():
     rng = np.random.default_rng(1)
     mean, other = (torch.from_numpy(rng.normal(size=(4, 7))) for _ in range(2))
-    log_sigma, log_other = (torch.from_numpy(rng.normal(size=7) * 0.3) for _ in range(2))
+    log_std, log_other = (torch.from_numpy(rng.normal(size=7) * 0.3) for _ in range(2))
     actions = torch.from_numpy(rng.normal(size=(4, 7)))
-    p = torch.distributions.Normal(mean, log_sigma.exp())
+    p = torch.distributions.Normal(mean, log_std.exp())
     q = torch.distributions.Normal(other, log_other.exp())
 
-    torch.testing.assert_close(log_prob(actions, mean, log_sigma), p.log_prob(actions).sum(-1))
-    torch.testing.assert_close(entropy(log_sigma), p.entropy().sum(-1)[0])
+    torch.testing.assert_close(log_prob(actions, mean, log_std), p.log_prob(actions).sum(-1))
+    torch.testing.assert_close(entropy(log_std), p.entropy().sum(-1)[0])
     torch.testing.assert_close(
-        kl_divergence(mean, log_sigma, other, log_other),
+        kl_divergence(mean, log_std, other, log_other),
         torch.distributions.kl_divergence(p, q).sum(-1).mean(),
     )
 
 
-def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it():
+def test_a_privileged_critic_observes_the_truth_and_the_policy_does_not():
     torch.manual_seed(0)
     network = new_network(
         NetworkConfig(units=(16, 8)), PAPER_OBSERVATION.model_copy(update={"critic": "privileged"})
@@ -106,12 +103,11 @@ def test_a_privileged_critic_judges_by_the_truth_and_the_policy_does_not_see_it(
 
 
 @pytest.mark.parametrize("critic", ["policy", "privileged"])
-@pytest.mark.parametrize("trunks", ["shared", "separate"])
-def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, critic):
+def test_a_renormalized_network_computes_the_same_with_other_moments(critic):
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     config = PAPER_OBSERVATION.model_copy(update={"critic": critic})
-    network = new_network(NetworkConfig(units=(32, 16, 8), trunks=trunks), config)
+    network = new_network(NetworkConfig(units=(32, 16, 8)), config)
     width = 37 + TRUTH * (critic == "privileged")
     old = Moments(rng.normal(size=width), rng.uniform(0.5, 2.0, size=width), 1)
     new = Moments(old.mean + 0.3 * rng.normal(size=width), old.var * rng.uniform(0.5, 2.0, size=width), 1)
@@ -127,8 +123,8 @@ def test_a_network_fed_by_other_moments_does_the_same_once_renormalized(trunks, 
     assert (changed[1] - before[1]).abs().max() > 0.01
 
 
-def test_a_flag_that_becomes_common_does_not_throw_the_policy_over():
-    """Its variance rises a thousandfold, and where it is up both normalised values are near the clip."""
+def test_a_flag_that_becomes_common_does_not_change_the_policy():
+    """Its variance becomes a thousand times larger, and where it is 1 both normalised values are near the clip."""
     torch.manual_seed(0)
     network = new_network(NetworkConfig(units=(32, 16)))
     torch.nn.init.orthogonal_(network.mean.weight, 0.3)

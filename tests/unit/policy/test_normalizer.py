@@ -37,7 +37,7 @@ def test_a_stage_change_resets_the_count_and_keeps_mean_and_variance():
     assert after.count == 1
     np.testing.assert_array_equal(after.mean, before.mean)
     np.testing.assert_array_equal(after.var, before.var)
-    # New data outvote the old at once, as they must when the rewards and so the states change.
+    # New data dominate at once, as they must when the rewards and so the states change.
     moved = after.merged(Moments.of(np.zeros((100, 4))))
     assert np.abs(moved.mean).max() < 0.05
 
@@ -54,7 +54,7 @@ def test_normalised_data_have_mean_0_variance_1_and_are_clipped_at_5():
     np.testing.assert_allclose(result[1:].std(axis=0), 1.0, atol=1e-2)
 
 
-def test_a_constant_input_does_not_blow_up():
+def test_a_constant_input_stays_finite():
     data = np.full((10, 1), 2.0, np.float32)
 
     assert np.isfinite(normalize(data + 0.01, Moments.of(data))).all()

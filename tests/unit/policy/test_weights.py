@@ -6,45 +6,24 @@ import torch
 from safetensors.numpy import load_file
 
 from common.policy.actor_critic import NetworkConfig
+from common.policy.box import names, policy_folder
+from common.policy.contract import PolicyError, contract_hash, contract_of, training_hash
+from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, Policy, load_policy, mean_policy, save_policy
 from common.policy.normalizer import Moments
-from common.policy.weights import (
-    ACTION_CONTRACT,
-    CONTRACT_FILE,
-    WEIGHTS_FILE,
-    Contract,
-    Policy,
-    PolicyError,
-    load_policy,
-    mean_policy,
-    new_network,
-    observation_contract,
-    pack,
-    save_policy,
-    task_hash,
-    unpack,
-)
-from common.rally.observation import PAPER_OBSERVATION, ObservationConfig
+from common.policy.weights import new_network, pack, unpack
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig, TeacherConfig
+from common.task.observation import PAPER_OBSERVATION, ObservationConfig
 
 SMALL = NetworkConfig(units=(16, 8))
 
 
-def make_contract(**changes):
-    values = {
-        "observation": observation_contract(PAPER_OBSERVATION),
-        "observation_options": PAPER_OBSERVATION,
-        "action": ACTION_CONTRACT,
-        "network": SMALL,
-        "control_rate_hz": 50.0,
-        "robot": "rails",
-        "launch": "paper",
-        "noise": "standard",
-        "run": "r",
-        "generation": 1,
-        "version": 2,
-        "stage": 3,
-        "frames": 4,
-    }
-    return Contract(**(values | changes))
+PAPER_TASK = TaskConfig(observation=PAPER_OBSERVATION)
+
+
+def make_contract(task=PAPER_TASK, **changes):
+    values = {"run": "r", "generation": 1, "version": 2, "stage": 3, "frames": 4}
+    return contract_of(task, ExperienceConfig(), SMALL, **(values | changes))
 
 
 def saved(folder):
@@ -55,7 +34,7 @@ def saved(folder):
     return network, moments
 
 
-def test_a_policy_comes_back_from_its_folder_bit_for_bit(tmp_path):
+def test_a_policy_is_loaded_from_its_folder_bit_for_bit(tmp_path):
     network, moments = saved(tmp_path / "latest")
 
     policy = load_policy(tmp_path / "latest")
@@ -68,24 +47,24 @@ def test_a_policy_comes_back_from_its_folder_bit_for_bit(tmp_path):
     assert policy.contract == make_contract()
 
 
-def test_a_folder_holds_what_acts_and_not_the_critic(tmp_path):
-    """So that a policy stays readable when what its critic saw has changed."""
+def test_a_folder_holds_the_policy_and_not_the_critic(tmp_path):
+    """So a policy stays readable when the critic's observation changes."""
     options = ObservationConfig(history=2)
     network = new_network(SMALL, options)
     moments = Moments(np.zeros(90), np.ones(90), 5)
-    contract = make_contract(observation=observation_contract(options), observation_options=options)
+    contract = make_contract(TaskConfig(observation=options))
     save_policy(tmp_path / "p", network, moments, contract)
 
     policy = load_policy(tmp_path / "p")
     tensors = load_file(tmp_path / "p" / WEIGHTS_FILE)
     obs = np.random.default_rng(0).normal(size=(3, 90)).astype(np.float32)
 
-    assert not any(name.startswith(("value", "judge", "critic")) for name in tensors)
+    assert not any(name.startswith(("value", "critic")) for name in tensors)
     assert policy.moments.mean.shape == (37 + 3 + 13 + 1 + 2 * 6,)
     np.testing.assert_array_equal(policy.act(obs), Policy(network, moments, contract).act(obs))
 
 
-def test_a_newer_policy_replaces_the_older_which_stays_once_more_for_its_readers(tmp_path):
+def test_a_newer_policy_replaces_the_older_whose_folder_stays_for_its_readers(tmp_path):
     for _ in range(4):
         saved(tmp_path / "latest")
 
@@ -93,13 +72,16 @@ def test_a_newer_policy_replaces_the_older_which_stays_once_more_for_its_readers
     assert load_policy(tmp_path / "latest").contract.version == 2
 
 
-def test_the_mean_of_policies_has_the_mean_of_their_weights_and_says_so():
-    def policy(seed, **changes):
+def test_the_mean_of_policies_has_the_mean_of_their_weights_and_lists_them():
+    def policy(seed, task=PAPER_TASK, **changes):
         torch.manual_seed(seed)
         moments = Moments(np.full(37, float(seed)), np.full(37, 1.0 + seed), 9)
-        return Policy(new_network(SMALL), moments, make_contract(**changes))
+        return Policy(new_network(SMALL), moments, make_contract(task, **changes))
 
-    one, other = policy(1, frames=10), policy(3, frames=30, launch="strong")
+    one, other = (
+        policy(1, frames=10),
+        policy(3, PAPER_TASK.model_copy(update={"launch": "strong"}), frames=30),
+    )
     before = {name: value.clone() for name, value in one.network.state_dict().items()}
     mean = mean_policy([one, other])
 
@@ -116,10 +98,11 @@ def test_the_mean_of_policies_has_the_mean_of_their_weights_and_says_so():
 
 
 def test_policies_of_different_shape_have_no_mean():
+    fast = PAPER_TASK.model_copy(update={"control_rate_hz": 200})
     one = Policy(new_network(SMALL), Moments.initial(37), make_contract())
-    other = Policy(new_network(SMALL), Moments.initial(37), make_contract(control_rate_hz=200.0))
+    other = Policy(new_network(SMALL), Moments.initial(37), make_contract(fast))
 
-    with pytest.raises(PolicyError, match=r"differ in control_rate_hz: 50.0 and 200.0"):
+    with pytest.raises(PolicyError, match=r"differ in control_rate_hz: 50 and 200"):
         mean_policy([one, other])
 
 
@@ -138,7 +121,9 @@ def test_weights_travel_as_bytes_and_arrive_unchanged():
         (lambda folder: (folder / WEIGHTS_FILE).unlink(), "no policy in .*No such file.*wanted is a folder"),
         (lambda folder: (folder / WEIGHTS_FILE).write_bytes(b"rubbish"), "not readable as safetensors"),
         (lambda folder: (folder / CONTRACT_FILE).write_text("{"), r"contract.json: file: Invalid JSON"),
-        (lambda folder: edit(folder, "robot", None), r"contract.json: robot: Input should be a valid string"),
+        (lambda folder: edit(folder, "run", None), r"contract.json: run: Input should be a valid string"),
+        (lambda folder: edit(folder, "task", {"robot": "r2"}), r"contract.json: task.robot: Input should be"),
+        (lambda folder: edit(folder, "format", 1), r"contract.json: format: Input should be 2"),
         (lambda folder: edit(folder, "surprise", 1), r"contract.json: surprise: Extra inputs"),
         (lambda folder: edit(folder, "observation", []), "layout is not this version's"),
         (lambda folder: edit(folder, "network", {"units": [16, 9]}), r"shape \(.*\); allowed is"),
@@ -160,10 +145,43 @@ def edit(folder, key, value):
     (folder / CONTRACT_FILE).write_text(json.dumps(contract | {key: value}))
 
 
-def test_learner_and_actors_disagree_about_any_difference_in_the_task():
-    base = task_hash(SMALL, {"noise": "standard"}, "paper")
+def test_the_texts_of_a_layout_may_change(tmp_path):
+    saved(tmp_path / "p")
+    folder = (tmp_path / "p").resolve()
+    contract = json.loads((folder / CONTRACT_FILE).read_text())
+    contract["observation"][0]["meaning"] = "other words"
+    (folder / CONTRACT_FILE).write_text(json.dumps(contract))
 
-    assert task_hash(SMALL, {"noise": "standard"}, "paper") == base
-    assert task_hash(NetworkConfig(units=(16, 9)), {"noise": "standard"}, "paper") != base
-    assert task_hash(SMALL, {"noise": "off"}, "paper") != base
-    assert task_hash(SMALL, {"noise": "standard"}, "strong") != base
+    assert load_policy(tmp_path / "p").contract.version == 2
+
+
+def test_any_difference_in_task_or_network_changes_the_contract():
+    base = contract_hash(TaskConfig(), SMALL)
+
+    assert contract_hash(TaskConfig(), SMALL) == base
+    assert contract_hash(TaskConfig(), NetworkConfig(units=(16, 9))) != base
+    assert contract_hash(TaskConfig(randomization="off"), SMALL) != base
+    assert contract_hash(TaskConfig(launch="strong"), SMALL) != base
+
+
+def test_any_difference_in_experience_changes_the_training_hash():
+    base = training_hash(TaskConfig(), SMALL, ExperienceConfig())
+
+    assert training_hash(TaskConfig(), SMALL, ExperienceConfig()) == base
+    assert training_hash(TaskConfig(launch="strong"), SMALL, ExperienceConfig()) != base
+    assert training_hash(TaskConfig(), SMALL, ExperienceConfig(end_at_hit_share=0.5)) != base
+    teacher = TeacherConfig(policy="default")
+    assert training_hash(TaskConfig(), SMALL, ExperienceConfig(teacher=teacher)) != base
+
+
+def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "default").mkdir()
+
+    assert names() == ["default", "paper"]
+    assert load_policy(policy_folder("default")).contract.run == "default"
+    assert policy_folder("./default").resolve() == tmp_path / "default"
+    with pytest.raises(
+        PolicyError, match="no policy 'nowhere'; allowed: a policy folder, or one of default, paper"
+    ):
+        policy_folder("nowhere")

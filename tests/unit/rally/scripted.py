@@ -1,6 +1,6 @@
-"""Scripted balls against a hand-moved racket, for the tests of rules, reward and noise.
+"""Scripted balls and a robot that moves as given, for the tests of rules, reward and randomization.
 
-Without drag and lift a ball flies a parabola, so that where it meets what can be worked out on paper.
+Without drag and lift a ball flies on a parabola, so the time and place of a touch can be computed by hand.
 """
 
 from collections.abc import Sequence
@@ -10,17 +10,18 @@ import numpy as np
 import numpy.typing as npt
 
 from common.physics.flight import SIMPLE
-from common.rally import play
-from common.rally.noise import PROFILES, NoiseProfile
-from common.rally.reward import PAPER_REWARD, RewardConfig, reward_table
-from common.rally.trajectory import Outcome, State, transition_table
+from common.rally.state import Rallies, RobotMotion, Rules, Step, allocate
+from common.rally.step import launch_rallies, play_step
+from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
+from common.task.reward import PAPER_REWARD, RewardConfig, reward_table
+from common.task.states import Outcome, State, transition_table
 
 Array = npt.NDArray[np.float64]
 
-CONTROL_PERIOD = 0.020  # s
+CONTROL_PERIOD = 0.020  # [s]
 SUBSTEPS = 5
 HOME = (0.0, 0.0, 0.0, 1.0, 1.0, 1.1, 0.0)
-"""The racket's face stands upright at x = -1.077, y = 0, z = 0.226 and looks at the opponent."""
+"""The racket's face is vertical at x = -1.077, y = 0, z = 0.226 and points to the opponent."""
 AWAY = (-0.75, -0.9, 0.0, -1.5, 0.0, 0.0, 0.0)
 """The arm leans back from the far corner of its rails: nothing but the beam (z < 0.15) is near the table."""
 TORQUE_LIMIT = np.array([400.0, 300.0, 24.0, 24.0, 12.0, 6.0, 3.0])
@@ -28,12 +29,12 @@ TORQUE_LIMIT = np.array([400.0, 300.0, 24.0, 24.0, 12.0, 6.0, 3.0])
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """What a scripted rally came to; rows are control steps."""
+    """Result of a scripted rally. Rows are control steps."""
 
     outcome: Outcome
     states: list[State]  # at the end of each step
     balls: Array  # (n, 9)
-    seen: Array  # (n, 8) the sample the robot goes by, and when it was taken
+    measurement: Array  # (n, 8) the robot's measurement of the ball, and its time stamp
     terms: Array  # (n, 8) reward.TERMS
     rewards: Array  # (n,)
     impulses: Array  # (n, 6)
@@ -44,13 +45,13 @@ class Played:
 
 def make_rules(
     stage: int = 1, rate_scale: float = 1.0, time_limit: float = 2.5, reward: RewardConfig = PAPER_REWARD
-) -> play.Rules:
-    return play.Rules(
+) -> Rules:
+    return Rules(
         transitions=transition_table(),
-        rewards=np.ascontiguousarray(reward_table(reward)[stage - 1]),
+        rewards=np.ascontiguousarray(reward_table()[stage - 1]),
         landing_scale=reward.landing_scale,
-        heading=reward.heading if stage == 3 else 0.0,
-        heading_scale=reward.heading_scale,
+        landing_bonus=reward.landing_bonus if stage == 3 else 0.0,
+        landing_bonus_scale=reward.landing_bonus_scale,
         rate_scale=rate_scale,
         torque_weight=reward.torque,
         torque_limit=TORQUE_LIMIT,
@@ -62,11 +63,11 @@ def make_rules(
     )
 
 
-def make_motion(before: Sequence[float], after: Sequence[float]) -> play.Motion:
-    """Return one control step of a robot that moves evenly between two poses, without force or contact."""
+def make_motion(before: Sequence[float], after: Sequence[float]) -> RobotMotion:
+    """Return one control step of a robot that moves uniformly between two poses, without force or contact."""
     share = np.arange(1, SUBSTEPS + 1)[:, None] / SUBSTEPS
     start = np.array(before)
-    return play.Motion(
+    return RobotMotion(
         start_pos=start[None],
         joint_pos=(start + share * (np.array(after) - start))[None],
         torque=np.zeros((1, SUBSTEPS, 7)),
@@ -75,7 +76,7 @@ def make_motion(before: Sequence[float], after: Sequence[float]) -> play.Motion:
     )
 
 
-def make_record(
+def make_launch(
     pos: Sequence[float],
     vel: Sequence[float],
     spin: Sequence[float] = (0.0, 0.0, 0.0),
@@ -86,18 +87,18 @@ def make_record(
 
 
 def begin(
-    record: Array,
+    launch: Array,
     state: State = State.TAU_01,
     target: tuple[float, float] | None = None,
     seed: int = 1,
-    noise: NoiseProfile = PROFILES["off"],
-) -> tuple[play.Rallies, play.Step]:
+    profile: RandomizationProfile = PROFILES["off"],
+) -> tuple[Rallies, Step]:
     """Return one rally in play, in ``state``."""
-    rallies, step = play.allocate(1)
-    play.launch_rallies(rallies, np.array([0]), record[None], np.array([seed], np.uint64), noise)
+    rallies, step = allocate(1)
+    launch_rallies(rallies, np.array([0]), launch[None], np.array([seed], np.uint64), profile)
     rallies.state[0] = state
     if target is not None:
-        rallies.condition[0, 8:10] = target
+        rallies.parameters[0, [RallyParameter.TARGET_X, RallyParameter.TARGET_Y]] = target
     return rallies, step
 
 
@@ -112,11 +113,11 @@ def play_ball(
     drag: float = 0.0,
     lift: float = 0.0,
     target: tuple[float, float] | None = None,
-    rules: play.Rules | None = None,
+    rules: Rules | None = None,
     seed: int = 1,
-    noise: NoiseProfile = PROFILES["off"],
+    profile: RandomizationProfile = PROFILES["off"],
     steps: int = 150,
-    foreseen: bool = False,
+    ends_at_hit: bool = False,
 ) -> Played:
     """Play a ball until its rally ends, for at most ``steps`` control steps.
 
@@ -129,23 +130,23 @@ def play_ball(
         rates: Joint velocities, constant.
         drag: Drag factor [-].
         lift: Lift factor [-].
-        target: Where to land [m]; None: as the seed has it.
+        target: Target [m]; None: the target of the seed.
         rules: ``make_rules()`` by default.
-        seed: Of the rally.
-        noise: Profile.
-        steps: Longest play.
-        foreseen: Whether a hit ball is flown to its end at once.
+        seed: Seed of the rally.
+        profile: Randomization.
+        steps: Most control steps.
+        ends_at_hit: Whether the flight after the hit is simulated to its landing at once.
     """
     rules = rules or make_rules()
-    rallies, step = begin(make_record(pos, vel, spin, drag, lift), state, target, seed, noise)
-    rallies.foreseen[0] = foreseen
-    states, balls, seen, terms, rewards, impulses = [], [], [], [], [], []
+    rallies, step = begin(make_launch(pos, vel, spin, drag, lift), state, target, seed, profile)
+    rallies.ends_at_hit[0] = ends_at_hit
+    states, balls, measured, terms, rewards, impulses = [], [], [], [], [], []
     for k in range(steps):
         before, after = (np.array(joints) + t * CONTROL_PERIOD * np.array(rates) for t in (k, k + 1))
-        play.play_step(rallies, make_motion(before, after), np.zeros((1, 7)), rules, noise, step)
+        play_step(rallies, make_motion(before, after), np.zeros((1, 7)), rules, profile, step)
         states.append(State(int(rallies.state[0])))
         balls.append(rallies.ball[0].copy())
-        seen.append(rallies.seen[0].copy())
+        measured.append(rallies.measurement[0].copy())
         terms.append(step.terms[0].copy())
         rewards.append(step.reward[0])
         impulses.append(step.impulse[0].copy())
@@ -155,7 +156,7 @@ def play_ball(
         outcome=Outcome(int(step.outcome[0])),
         states=states,
         balls=np.array(balls),
-        seen=np.array(seen),
+        measurement=np.array(measured),
         terms=np.array(terms),
         rewards=np.array(rewards),
         impulses=np.array(impulses),

@@ -4,11 +4,13 @@ import dataclasses
 from typing import Any
 
 from common.comms.messages import Verdict, VerdictKind
+from services.learner.admission import Header, LearnerState
 from services.learner.intake import Intake, IntakeConfig
-from services.learner.verdicts import Header, Standing
 from tests.unit.comms.message_examples import make_rollout
 
-STANDING = Standing(run="night", generation=1, version=10, stage_number=2, stage=3, contract_hash="c0ffee")
+LEARNER_STATE = LearnerState(
+    run="night", generation=1, version=10, stage_number=2, stage=3, training_hash="c0ffee"
+)
 ROLLOUT = make_rollout()
 
 
@@ -21,13 +23,13 @@ def make_header(sequence: int = 0, **changes: Any) -> Header:
         actor="actor-0",
         incarnation=1,
         sequence=sequence,
-        contract_hash="c0ffee",
+        training_hash="c0ffee",
     )
     return dataclasses.replace(header, **changes)
 
 
-def make_intake(*, standing: Standing = STANDING, **settings: Any) -> Intake:
-    return Intake(IntakeConfig(**{"dataset_rollouts": 4, **settings}), standing)
+def make_intake(*, learner: LearnerState = LEARNER_STATE, **settings: Any) -> Intake:
+    return Intake(IntakeConfig(**{"dataset_rollouts": 4, **settings}), learner)
 
 
 def make_verdict(kind: VerdictKind, **changes: Any) -> Verdict:

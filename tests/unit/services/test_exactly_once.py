@@ -1,4 +1,4 @@
-"""Outbox and intake on a network that delays, repeats and loses, with actors and learners that die."""
+"""Outbox and intake on a network that delays, repeats and loses messages, with actors and learners that die."""
 
 import dataclasses
 from collections import Counter
@@ -12,10 +12,10 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from common.comms.messages import ActorReport, Verdict, VerdictKind
 from services.actor import outbox as ob
 from services.actor.outbox import Outbox, OutboxConfig
+from services.learner.admission import Header, LearnerState
 from services.learner.intake import Intake, IntakeConfig, Queued
-from services.learner.ledger import Ledger, Remembered
-from services.learner.verdicts import Header, Standing
-from tests.unit.services.accounting import ROLLOUT, STANDING, make_header
+from services.learner.ledger import AccountSnapshot, Ledger
+from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header
 
 OUTBOX = OutboxConfig(retry_first_s=1.0, retry_max_s=4.0, give_up_s=30.0)
 INTAKE = IntakeConfig(dataset_rollouts=2, max_lag=1, queue_rollouts=3)
@@ -29,7 +29,7 @@ def key_of(header: Header) -> Key:
 
 @dataclasses.dataclass
 class Actor:
-    """One life of an actor; ``headers`` stand for its rollouts."""
+    """One life of an actor; ``headers`` represent its rollouts."""
 
     name: str
     incarnation: int
@@ -52,10 +52,10 @@ class Actor:
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """What a learner can start from, and the truth that belongs to it."""
+    """A state that a learner can start from, and the true fates at that time."""
 
-    standing: Standing
-    memory: tuple[Remembered, ...]
+    learner: LearnerState
+    accounts: tuple[AccountSnapshot, ...]
     trained: frozenset[Key]
     judged: dict[Key, VerdictKind]
 
@@ -64,18 +64,18 @@ class World(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.now = 0.0
-        self.intake: Intake | None = Intake(INTAKE, STANDING)
+        self.intake: Intake | None = Intake(INTAKE, LEARNER_STATE)
         self.generations = 1
         self.dataset: tuple[Queued, ...] = ()  # of the update that is running
         self.trained: set[Key] = set()  # by this learner and those it was restored from
         self.judged: dict[Key, VerdictKind] = {}  # final verdicts given, likewise
-        self.checkpoint = Checkpoint(STANDING, (), frozenset(), {})
+        self.checkpoint = Checkpoint(LEARNER_STATE, (), frozenset(), {})
         self.actors = [Actor("a", 1), Actor("b", 1)]
         self.dead: list[Actor] = []
         self.requests: list[tuple[Actor, int]] = []  # may be delivered late or twice
         self.replies: list[tuple[Actor, int, Verdict]] = []
         self.reports: list[ActorReport] = []
-        self.out_of_sight: set[tuple[str, int]] = set()  # lives whose token this learner has seen go
+        self.out_of_sight: set[tuple[str, int]] = set()  # lives whose token is gone for this learner
 
     # ---- actors
 
@@ -84,15 +84,15 @@ class World(RuleBasedStateMachine):
         actor = self.actors[which]
         if len(actor.outbox.flights) == OUTBOX.window:
             return
-        standing = self.checkpoint.standing if self.intake is None else self.intake.standing
+        learner = self.checkpoint.learner if self.intake is None else self.intake.learner
         sequence = actor.outbox.next_sequence
         actor.headers[sequence] = make_header(
             sequence,
             actor=actor.name,
             incarnation=actor.incarnation,
-            generation=standing.generation,
-            version=max(0, standing.version - lag),
-            stage_number=standing.stage_number - stale,
+            generation=learner.generation,
+            version=max(0, learner.version - lag),
+            stage_number=learner.stage_number - stale,
         )
         actor.outbox = ob.offer(actor.outbox, b"", self.now)
 
@@ -122,20 +122,20 @@ class World(RuleBasedStateMachine):
         actor = self.actors[which]
         self.dead.append(actor)
         self.actors[which] = Actor(actor.name, actor.incarnation + 1)
-        self.lose_sight(actor)
+        self.lose_token(actor)
 
     @rule(which=st.integers(0, 1))
     def cut_off(self, which: int) -> None:
-        self.lose_sight(self.actors[which])
+        self.lose_token(self.actors[which])
 
     @rule(which=st.integers(0, 1))
-    def come_back_into_sight(self, which: int) -> None:
+    def return_token(self, which: int) -> None:
         life = self.actors[which].name, self.actors[which].incarnation
         if self.intake is not None:
             self.intake.seen(*life)
             self.out_of_sight.discard(life)
 
-    def lose_sight(self, actor: Actor) -> None:
+    def lose_token(self, actor: Actor) -> None:
         if self.intake is not None:
             self.intake.gone(actor.name, actor.incarnation)
             self.out_of_sight.add((actor.name, actor.incarnation))
@@ -148,7 +148,7 @@ class World(RuleBasedStateMachine):
 
     @rule(which=st.integers(0, 1), answered=st.booleans())
     def round_trip(self, which: int, answered: bool) -> None:
-        """All goes well, but perhaps for the answer: random steps alone rarely get this far."""
+        """Everything succeeds except perhaps the answer: random steps alone rarely reach this."""
         self.publish(which, lag=0, stale=False)
         self.send(which, wait=5.0)
         while self.requests and self.intake is not None:
@@ -187,12 +187,12 @@ class World(RuleBasedStateMachine):
                 actor.outbox = ob.credited(actor.outbox, verdict)
 
     def judge(self, key: Key, verdict: Verdict) -> None:
-        """Hold a verdict against the one of record."""
+        """Compare a verdict with the recorded one."""
         if verdict.first in ob.FINAL_VERDICTS:
             if key in self.judged:
                 assert verdict.first is self.judged[key]
                 assert verdict.kind is VerdictKind.DUPLICATE
-            elif verdict.kind is not VerdictKind.DUPLICATE:  # else: settled by the actor's report
+            elif verdict.kind is not VerdictKind.DUPLICATE:  # otherwise the actor's report has settled it
                 self.judged[key] = verdict.first
 
     # ---- the learner
@@ -205,14 +205,14 @@ class World(RuleBasedStateMachine):
         self.dataset = self.intake.take_dataset()
         for entry in self.dataset:
             assert key_of(entry.header) not in self.trained, "trained twice"
-            assert self.intake.standing.version - entry.header.version <= INTAKE.max_lag
-            assert self.intake.standing.stage_number == entry.header.stage_number
+            assert self.intake.learner.version - entry.header.version <= INTAKE.max_lag
+            assert self.intake.learner.stage_number == entry.header.stage_number
 
     @precondition(lambda self: self.intake is not None and bool(self.dataset))
     @rule(next_stage=st.booleans())
     def end_update(self, next_stage: bool) -> None:
         self.trained.update(key_of(entry.header) for entry in self.dataset)
-        old = self.intake.standing
+        old = self.intake.learner
         stage_number = old.stage_number + next_stage
         self.intake.finish_update(
             dataclasses.replace(old, version=old.version + 1, stage_number=stage_number)
@@ -223,7 +223,7 @@ class World(RuleBasedStateMachine):
     @rule()
     def save(self) -> None:
         self.checkpoint = Checkpoint(
-            self.intake.standing, self.intake.memory(), frozenset(self.trained), dict(self.judged)
+            self.intake.learner, self.intake.snapshots(), frozenset(self.trained), dict(self.judged)
         )
 
     @rule(chance=st.integers(0, 3))
@@ -235,8 +235,8 @@ class World(RuleBasedStateMachine):
     @rule()
     def restart_learner(self) -> None:
         self.generations += 1
-        standing = dataclasses.replace(self.checkpoint.standing, generation=self.generations)
-        self.intake = Intake(INTAKE, standing, self.checkpoint.memory)
+        learner = dataclasses.replace(self.checkpoint.learner, generation=self.generations)
+        self.intake = Intake(INTAKE, learner, self.checkpoint.accounts)
         self.out_of_sight = set()
         self.trained = set(self.checkpoint.trained)
         self.judged = dict(self.checkpoint.judged)
@@ -262,7 +262,7 @@ class World(RuleBasedStateMachine):
         assert sum(ledgers.values(), Ledger()).trained == len(self.trained)
 
     @invariant()
-    def of_who_is_out_of_sight_only_what_came_is_in_flight(self) -> None:
+    def of_actors_without_token_only_queued_rollouts_are_in_flight(self) -> None:
         if self.intake is None:
             return
         came = Counter(key_of(entry.header)[:2] for entry in (*self.intake._queue, *self.dataset))
@@ -270,11 +270,11 @@ class World(RuleBasedStateMachine):
             assert self.intake.ledgers()[life].in_flight == came[life]
 
     def teardown(self) -> None:
-        """Once all are in sight and after two reports each, the learner's ledger is what both sides' sets say."""
+        """When all tokens are present and after two reports each, the learner's ledger equals the true fates."""
         if self.intake is None:
             self.restart_learner()
         for which, actor in enumerate(self.actors):
-            self.come_back_into_sight(which)
+            self.return_token(which)
             for _ in range(2):
                 actor.outbox = ob.credited(actor.outbox, self.intake.report(actor.report(), self.now))
             ledger = self.intake.ledgers()[actor.name, actor.incarnation]
@@ -312,8 +312,8 @@ TestExactlyOnce = World.TestCase
 @pytest.mark.parametrize("max_lag", [0, 1, 2])
 @pytest.mark.parametrize("actors", [1, 3])
 def test_paced_actors_fill_every_dataset_without_a_refusal_and_within_the_lag(max_lag, actors):
-    """The deadlock test: whoever may not publish only reports; every dataset must still come together."""
-    intake = Intake(IntakeConfig(dataset_rollouts=5, max_lag=max_lag), STANDING)
+    """No deadlock: an actor that may not publish only reports, and every dataset is still completed."""
+    intake = Intake(IntakeConfig(dataset_rollouts=5, max_lag=max_lag), LEARNER_STATE)
     crew = [Actor(f"actor-{i}", 1) for i in range(actors)]
     lags: list[int] = []
     now = 0.0
@@ -322,14 +322,14 @@ def test_paced_actors_fill_every_dataset_without_a_refusal_and_within_the_lag(ma
         for actor in crew:
             play(actor, intake, now)
         dataset = intake.take_dataset()
-        lags += [intake.standing.version - entry.header.version for entry in dataset]
-        for actor in crew:  # meanwhile the update runs
+        lags += [intake.learner.version - entry.header.version for entry in dataset]
+        for actor in crew:  # the update runs meanwhile
             play(actor, intake, now)
         if dataset:
-            intake.finish_update(dataclasses.replace(intake.standing, version=intake.standing.version + 1))
+            intake.finish_update(dataclasses.replace(intake.learner, version=intake.learner.version + 1))
 
     total = sum(intake.ledgers().values(), Ledger())
-    assert intake.standing.version > STANDING.version + 50
+    assert intake.learner.version > LEARNER_STATE.version + 50
     assert total.refused == {}
     assert total.lost == 0
     assert max(lags) <= min(max_lag, 1)
@@ -337,18 +337,18 @@ def test_paced_actors_fill_every_dataset_without_a_refusal_and_within_the_lag(ma
 
 def play(actor: Actor, intake: Intake, now: float) -> None:
     """One turn of an actor that always has the newest policy: publish if it may, else report."""
-    standing = intake.standing
-    if ob.idle_reason(actor.outbox, standing.generation, standing.version):
+    learner = intake.learner
+    if ob.idle_reason(actor.outbox, learner.generation, learner.version):
         actor.outbox = ob.credited(actor.outbox, intake.report(actor.report(), now))
         return
     sequence = actor.outbox.next_sequence
-    header = make_header(sequence, actor=actor.name, version=standing.version)
+    header = make_header(sequence, actor=actor.name, version=learner.version)
     actor.outbox = ob.sent(ob.offer(actor.outbox, b"", now), sequence)
     actor.hear(sequence, intake.arrive(header, ROLLOUT, now), now)
 
 
-def test_a_silent_actors_credits_do_not_hold_up_a_synchronous_run():
-    intake = Intake(IntakeConfig(dataset_rollouts=4, max_lag=0, credit_patience_s=30.0), STANDING)
+def test_a_silent_actors_credits_do_not_block_a_synchronous_run():
+    intake = Intake(IntakeConfig(dataset_rollouts=4, max_lag=0, credit_patience_s=30.0), LEARNER_STATE)
     silent, eager = Actor("silent", 1), Actor("eager", 1)
     intake.report(silent.report(), now=0.0)
 

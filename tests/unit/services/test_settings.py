@@ -1,10 +1,8 @@
-"""Settings that no run could work with are refused as one line; those beside them are not."""
+"""Settings that can't work are refused with one line; the nearest ones that work are not."""
 
 import pytest
 
-from common.config import ConfigError, load
-from deploy.config import shared_out
-from deploy.local import settings as run_settings
+from common.service.config import ConfigError, load
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
 
@@ -46,23 +44,27 @@ def generator(*argv: str) -> GeneratorConfig:
         (
             learner,
             ["--network.units", "64,0"],
-            "learner.network.units = '0' (--network.units); allowed: list of a whole number, from 1",
+            "network.units = '0' (--network.units); allowed: list of a whole number, from 1",
         ),
         (
             learner,
             ["--network.units", "-3,4"],
-            "learner.network.units = '-3' (--network.units); allowed: list of a whole number, from 1",
+            "network.units = '-3' (--network.units); allowed: list of a whole number, from 1",
         ),
         (
             learner,
             ["--network.units="],
-            "learner.network.units = [] (--network.units); allowed: list of a whole number, from 1",
+            "network.units = [] (--network.units); allowed: list of a whole number, from 1",
         ),
         (generator, ["--index", "1"], "generator: index 1; allowed: 0 to 0, of 1 generators"),
-        (generator, ["--index", "3", "--of", "3"], "generator: index 3; allowed: 0 to 2, of 3 generators"),
+        (
+            generator,
+            ["--index", "3", "--generators", "3"],
+            "generator: index 3; allowed: 0 to 2, of 3 generators",
+        ),
     ],
 )
-def test_what_could_never_work_is_one_line_that_says_what_is_allowed(read, argv, line):
+def test_settings_that_cannot_work_are_one_line_that_says_what_is_allowed(read, argv, line):
     with pytest.raises(ConfigError) as caught:
         read(*argv)
 
@@ -74,18 +76,25 @@ def test_what_could_never_work_is_one_line_that_says_what_is_allowed(read, argv,
     [
         (learner, [DATASET, "256"]),
         (learner, [DATASET, "300", QUEUE, "300"]),
-        (learner, [RATE_MIN, "4e-6", RATE_MAX, "1.2e-5"]),  # below what the rate starts from: it is clipped
+        (learner, [RATE_MIN, "4e-6", RATE_MAX, "1.2e-5"]),  # below the starting rate, which is clipped
         (learner, [RATE_MIN, "1e-3", RATE_MAX, "1e-3"]),
         (learner, ["--network.units", "1"]),
-        (generator, ["--index", "1", "--of", "2"]),
+        (generator, ["--index", "1", "--generators", "2"]),
     ],
 )
-def test_the_nearest_that_works_is_taken(read, argv):
+def test_the_nearest_settings_that_work_are_accepted(read, argv):
     read(*argv)
 
 
 def test_a_run_of_more_actors_than_the_queue_has_places_gets_a_longer_one():
-    intake = shared_out(run_settings(["--run", "r", "--actors", "300"])).learner.intake
+    intake = learner("--actors", "300").intake.for_actors(300)
 
     assert (intake.dataset_rollouts, intake.queue_rollouts) == (300, 600)
     assert type(intake)(**intake.model_dump()) == intake
+
+
+def test_a_teacher_without_effect_is_refused():
+    with pytest.raises(
+        ConfigError, match=r"ppo\.correction_weight 0 with experience\.teacher\.policy; allowed: above 0"
+    ):
+        learner("--experience.teacher.policy", "default", "--ppo.correction-weight", "0")

@@ -1,0 +1,36 @@
+"""Settings that all benchmarks have, and how a benchmark is started."""
+
+import sys
+from collections.abc import Callable
+from threading import Event
+from typing import Final, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.service.config import load
+from common.service.process import run_service
+
+SECTION: Final = "bench"
+
+
+class BenchmarkConfig(BaseModel):
+    """Settings of a benchmark."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    json_line: bool = Field(False, alias="json", description="print one JSON object as the last line")
+
+
+_Config = TypeVar("_Config", bound=BenchmarkConfig)
+
+
+def run(name: str, model: type[_Config], main: Callable[[_Config, Event], int]) -> int:
+    """Return the exit status of a benchmark that is started from the command line.
+
+    Args:
+        name: Of its file.
+        model: Its settings; the docstring says what it measures.
+        main: Measures and prints. It gets the settings, and the event that Ctrl-C sets.
+    """
+    prog = f"python -m benchmarks.{name}"
+    return run_service(prog, lambda stop: main(load(model, sys.argv[1:], prog=prog, section=SECTION), stop))

@@ -1,0 +1,69 @@
+"""Hit corrections of an environment: records the drives' limits and corrects the actions before each hit."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from common.env.robot import RobotBatch
+from common.physics.flight import Flight
+from common.rally.hit_correction import BACK, corrections
+from common.rally.state import Rallies, RobotMotion
+
+Floats = npt.NDArray[np.float32]
+Rows = npt.NDArray[np.int64]
+
+AT_LIMIT: Final = 1.0 - 1e-9  # [-] share of a drive's largest force from which on it counts as at its limit
+
+
+@dataclass(frozen=True, slots=True)
+class HitCorrections:
+    """Balls hit in one step, and how the last actions should have differed."""
+
+    rows: Rows  # (n,) which environment
+    corrections: Floats  # (n, BACK, 7) [half-range] by control step, the newest first
+    steps: Rows  # (n,) how many control steps back each reaches: at most to the rally's beginning
+
+
+NO_HIT_CORRECTIONS: Final = HitCorrections(
+    np.zeros(0, np.int64), np.zeros((0, BACK, 7), np.float32), np.zeros(0, np.int64)
+)
+
+
+class HitCorrector:
+    """Records which drives were at their limits, and corrects hits (``common/rally/hit_correction.py``).
+
+    Args:
+        robot: The robots.
+        flight: Model of the aerodynamics.
+    """
+
+    def __init__(self, robot: RobotBatch, flight: Flight) -> None:
+        self._flight_model = int(flight)
+        self._drives = robot.drives
+        self._largest = robot.torque_limit * AT_LIMIT
+        self._limited = np.zeros((robot.count, BACK, robot.substeps, 7), np.bool_)
+        self._newest = 0
+        self._found = np.zeros((robot.count, BACK, 7))
+        self._steps = np.zeros(robot.count, np.int64)
+
+    def update(self, rallies: Rallies, motion: RobotMotion, corrects: bool) -> HitCorrections:
+        """Record one control step of all robots, and return the corrections of its hits if ``corrects``."""
+        self._newest = (self._newest + 1) % BACK
+        self._limited[:, self._newest] = np.abs(motion.torque) >= self._largest
+        if not corrects:
+            return NO_HIT_CORRECTIONS
+        corrections(
+            rallies.hit,
+            rallies.parameters,
+            self._flight_model,
+            self._limited,
+            self._newest,
+            self._drives,
+            motion.step,
+            self._found,
+            self._steps,
+        )
+        rows = np.flatnonzero(self._steps)
+        return HitCorrections(rows, self._found[rows].astype(np.float32), self._steps[rows])

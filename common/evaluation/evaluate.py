@@ -1,0 +1,59 @@
+"""Measuring a policy, for `topspin evaluate` and for other commands that need the measures."""
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from common.errors import ReportedError
+from common.evaluation.breakdown import breakdown, survival, table
+from common.evaluation.match import MatchConfig, environments, evaluation_rallies, match_task, play_match
+from common.evaluation.measures import measures
+from common.policy.folder import Policy
+
+
+class StoppedError(ReportedError):
+    """A stop was requested before the command was done."""
+
+
+def check(stop: Event) -> None:
+    """Raise StoppedError if a stop was requested."""
+    if stop.is_set():
+        raise StoppedError("stopped before it was done")
+
+
+def measure(
+    policy: Policy, folder: Path, config: MatchConfig, on_tick: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
+    """Return a policy's measures over fixed rallies, the match's conditions, and rates by kind of ball (``by``)."""
+    started = time.monotonic()
+    task = match_task(policy.contract, config, config.expected_spin)
+    rallies = evaluation_rallies(config.rallies, task, config.seed)
+    result = play_match(policy, rallies, task, config.envs, on_tick)
+    match = {
+        "launch": task.launch,
+        "randomization": task.randomization,
+        "rounds": task.rounds,
+        "envs": environments(config.rallies, config.envs, task.rounds),
+        "seed": config.seed,
+        "collision": task.collision,
+        "perception": task.perception,
+        "expected_spin": task.observation.expected_spin,
+        "policy": str(folder),
+        "seconds": round(time.monotonic() - started, 2),
+    }
+    return measures(result) | survival(result) | match | {"by": breakdown(result)}
+
+
+def print_measures(found: dict[str, Any], as_json: bool) -> None:
+    """Print measures for a person, or as one JSON line."""
+    if as_json:
+        sys.stdout.write(json.dumps(found) + "\n")
+        return
+    for name, value in found.items():
+        if name != "by":
+            sys.stdout.write(f"{name:>24}  {value}\n")
+    sys.stdout.write("\n".join(table(found["by"])) + "\n")

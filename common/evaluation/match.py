@@ -1,0 +1,167 @@
+"""Playing a fixed set of rallies with a deterministic policy, every one to its end."""
+
+from collections.abc import Callable
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field
+
+from common.env.rally_env import FinishedRallies, Launches, RallyEnv
+from common.evaluation.measures import MatchResult
+from common.evaluation.unplayed_flight import unplayed_flight
+from common.policy.contract import Contract
+from common.policy.folder import Policy
+from common.rally.state import NO_SAMPLE
+from common.task.config import MatchConditions, PlayConditions, TaskConfig
+from common.task.experience import MATCH
+from common.task.launch import Purpose, RallyBlock, draw_rallies
+from common.task.observation import ExpectedSpin
+from common.task.randomization import RallyParameter
+
+DEFAULT_ENVS: Final = 250
+EPISODES_EACH: Final = 4  # each environment has rallies for at least so many whole episodes
+
+# Settings of every command that plays a match
+Environments = Annotated[
+    int,
+    Field(
+        ge=1,
+        le=65536,
+        description="environments played together; each plays rallies / envs balls of the same opponent",
+    ),
+]
+MatchSpin = Annotated[
+    ExpectedSpin | Literal["contract"],
+    Field(
+        description="spin that the robot expects (task.observation.expected_spin): mild, mixed, strong or learnt; "
+        "contract: as the policy's contract says"
+    ),
+]
+
+
+class MatchConfig(MatchConditions):
+    """A match: fixed rallies, and the conditions of play."""
+
+    rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to play")
+    seed: int = Field(20260, ge=0, lt=2**63, description="seed of the rallies")
+    envs: Environments = DEFAULT_ENVS
+    expected_spin: MatchSpin = "contract"
+
+
+def match_task(
+    contract: Contract, conditions: PlayConditions, expected_spin: MatchSpin = "contract"
+) -> TaskConfig:
+    """Return the task of a match: the contract's, under the match's conditions."""
+    return contract.expecting(expected_spin).task.under(conditions)
+
+
+class FixedRallies:
+    """A source that gives each rally of a set once, in order, and then filler rallies.
+
+    Filler rallies keep environments busy while the last rallies of the set are still in play. They are not validated,
+    so no rate counts them. The match waits for the whole set. If it stopped after n rallies, rallies that end early
+    would be counted too often.
+    """
+
+    def __init__(self, rallies: RallyBlock, filler: RallyBlock) -> None:
+        self._rallies = rallies
+        self._filler = filler
+        self._dealt = 0
+        self._filled = 0
+
+    def take(self, count: int) -> Launches:
+        """Return the next ``count`` launches."""
+        fresh = min(count, len(self._rallies.seeds) - self._dealt)
+        rows = slice(self._dealt, self._dealt + fresh)
+        extra = (self._filled + np.arange(count - fresh)) % len(self._filler.seeds)
+        self._dealt += fresh
+        self._filled += count - fresh
+        paths = None
+        if self._rallies.paths is not None:  # filler rallies have no recorded track
+            paths = np.full((count, *self._rallies.paths.shape[1:]), NO_SAMPLE)
+            paths[:fresh] = self._rallies.paths[rows]
+        return Launches(
+            np.concatenate((self._rallies.launches[rows], self._filler.launches[extra])),
+            np.concatenate((self._rallies.seeds[rows], self._filler.seeds[extra])),
+            np.arange(count) < fresh,
+            paths,
+        )
+
+
+def evaluation_rallies(count: int, task: TaskConfig, seed: int) -> RallyBlock:
+    """Return the fixed rallies of an evaluation: the same for every caller, and never used in training."""
+    return draw_rallies(count, task, seed=seed, purpose=Purpose.EVALUATION)
+
+
+def environments(rallies: int, most: int, rounds: int) -> int:
+    """Return how many environments share a match's rallies: at most one per rally.
+
+    With several rounds, each environment needs rallies for several episodes. Otherwise all balls of the set would be
+    first balls.
+    """
+    room = rallies // (EPISODES_EACH * rounds) if rounds > 1 else rallies
+    return min(most, max(1, room))
+
+
+def play_match(
+    policy: Policy,
+    rallies: RallyBlock,
+    task: TaskConfig,
+    envs: int = DEFAULT_ENVS,
+    on_tick: Callable[[], None] = lambda: None,
+) -> MatchResult:
+    """Return the result of ``rallies``, played without exploration noise, in the order in which they ended.
+
+    Args:
+        policy: The policy.
+        rallies: The set, each played once.
+        task: The task.
+        envs: Environments played together, at most.
+        on_tick: Called between control steps, so that the caller can do other work, or raise.
+
+    A rally in which the simulation failed is left out, so there may be fewer rows than rallies.
+    """
+    envs = environments(len(rallies.seeds), envs, task.rounds)
+    plain = TaskConfig(randomization=task.randomization)
+    filler = draw_rallies(64, plain, seed=0, purpose=Purpose.FALLBACK)
+    source = FixedRallies(rallies, filler)
+    env = RallyEnv(envs, task, source, stage=3, experience=MATCH, path_rows=rallies.path_rows)
+    obs = env.reset()
+    ended: list[FinishedRallies] = []
+    left = len(rallies.seeds)
+    while left > 0:
+        on_tick()
+        step = env.step(policy.act(obs))
+        obs = step.obs
+        if step.finished.rows.size:
+            ended.append(step.finished)
+            # By seed: a rally that the simulation's failure ended is over too, but no rate counts it.
+            left -= int(np.isin(step.finished.seeds, rallies.seeds).sum())
+
+    def rated(name: str) -> npt.NDArray[Any]:
+        return np.concatenate([getattr(f, name)[f.validated] for f in ended])
+
+    seeds, parameters = rated("seeds"), rated("parameters")
+    launches = launches_of(seeds, rallies)
+    bounces, arrivals = unplayed_flight(launches, parameters, task.flight_model)
+    return MatchResult(
+        seeds=seeds,
+        outcomes=rated("outcomes"),
+        landing_errors=rated("landing_errors"),
+        caught=rated("caught"),
+        over=rated("over"),
+        returns=rated("returns"),
+        rounds=rated("rounds"),
+        launches=launches,
+        landings=rated("landings"),
+        targets=parameters[:, [RallyParameter.TARGET_X, RallyParameter.TARGET_Y]],
+        bounces=bounces[:, :2],
+        arrivals=arrivals,
+    )
+
+
+def launches_of(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.float64]:
+    """Return the launches (n, 11) of the rallies with these seeds (n,), all of which ``rallies`` must hold."""
+    order = np.argsort(rallies.seeds)
+    return rallies.launches[order[np.searchsorted(rallies.seeds, seeds, sorter=order)]]

@@ -1,0 +1,30 @@
+"""The box: trained policies that come with the project, found by name from any working directory."""
+
+from pathlib import Path
+from typing import Final
+
+from common.policy.contract import PolicyError
+from common.policy.folder import CONTRACT_FILE
+
+BOX: Final = Path(__file__).resolve().parents[2] / "assets" / "policies"
+
+
+def names() -> list[str]:
+    """Return the names of the policies in the box."""
+    return sorted(path.parent.name for path in BOX.glob(f"*/{CONTRACT_FILE}"))
+
+
+def policy_folder(given: str) -> Path:
+    """Return the folder of a policy that is given by its name in the box or by its folder.
+
+    A name of the box means the box, whatever the working directory holds; ``./default`` is a folder.
+
+    Raises:
+        PolicyError: It is neither.
+    """
+    if given in names():
+        return BOX / given
+    folder = Path(given)
+    if not folder.exists():
+        raise PolicyError(f"no policy {given!r}; allowed: a policy folder, or one of {', '.join(names())}")
+    return folder

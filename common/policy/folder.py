@@ -1,0 +1,173 @@
+"""A policy on disk: a folder with safetensors weights and a contract.
+
+``weights.safetensors`` holds network and observation moments. ``contract.json`` names each input and
+output with its unit, and says how the policy was trained.
+"""
+
+import copy
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from common.policy.actor_critic import ActorCritic
+from common.policy.contract import Contract, PolicyError, described, same_numbers
+from common.policy.normalizer import Moments, normalize
+from common.policy.weights import load_state, new_network, observation_moments, state_tensors
+from common.task.observation import ACTION, ACTION_SIZE, policy_layout, size
+
+WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
+_ACTING: Final = ("trunk.", "mean.", "log_std")  # the policy's parameters; the others are the critic's
+_OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
+_MOMENTS: Final = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A policy to play: network, frozen normaliser and contract. The critic of a policy from a folder is all zeros."""
+
+    network: ActorCritic
+    moments: Moments
+    contract: Contract
+
+    def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is used."""
+        width = self.network.obs_size
+        with torch.inference_mode():
+            mean = self.network.act(torch.from_numpy(normalize(obs[:, :width], self.moments.first(width))))
+        actions: npt.NDArray[np.float32] = mean.numpy()
+        return actions
+
+
+def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
+    """Write the two files of a policy, without its critic, into ``folder``; no process may read it meanwhile."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors: dict[str, npt.NDArray[Any]] = {
+        name: value for name, value in state_tensors(network).items() if name.startswith(_ACTING)
+    }
+    acting = moments.first(network.obs_size)
+    tensors[_OBS_MEAN], tensors[_OBS_VAR] = acting.mean, acting.var
+    tensors[_OBS_COUNT] = np.array(acting.count, np.int64)
+    (folder / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
+    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+
+
+def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
+    """Write a policy folder; a reader gets the old policy or the new one, never a mixture.
+
+    The folder is a symbolic link that is replaced in one step. The previous folder stays until the next save, since
+    processes may be reading it. Older ones are deleted.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    fresh.chmod(0o755)
+    write_policy(fresh, network, moments, contract)
+    for path in fresh.iterdir():
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+    old = folder.parent / os.readlink(folder) if folder.is_symlink() else None
+    link = folder.parent / f"{fresh.name}.link"
+    link.symlink_to(fresh.name)
+    os.replace(link, folder)
+    for other in folder.parent.glob(f".{folder.name}-*"):
+        if other not in (fresh, old):
+            shutil.rmtree(other, ignore_errors=True)
+
+
+def load_policy(folder: Path) -> Policy:
+    """Return the policy in ``folder``; raises PolicyError with one line where it can't be used."""
+    folder = Path(os.path.realpath(folder))
+    try:
+        contract = Contract.model_validate_json((folder / CONTRACT_FILE).read_text())
+        tensors = load_tensors((folder / WEIGHTS_FILE).read_bytes())
+    except OSError as error:
+        raise PolicyError(
+            f"no policy in {folder}: {error.strerror} ({Path(error.filename or '').name}); "
+            f"wanted is a folder with {WEIGHTS_FILE} and {CONTRACT_FILE}"
+        ) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise PolicyError(f"{folder / CONTRACT_FILE}: {where or 'file'}: {first['msg']}") from None
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise PolicyError(f"{folder / WEIGHTS_FILE} is not readable as safetensors: {error}") from None
+    options = contract.task.observation
+    layout = policy_layout(options)
+    if not (
+        same_numbers(contract.observation, described(layout))
+        and same_numbers(contract.action, described(ACTION))
+    ):
+        raise PolicyError(
+            f"{folder / CONTRACT_FILE}: its observation or action layout is not this version's "
+            f"({size(layout)} and {ACTION_SIZE} numbers, see common/task/observation.py)"
+        )
+    for name in _MOMENTS:
+        if name not in tensors:
+            raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
+    moments = observation_moments(tensors[_OBS_MEAN], tensors[_OBS_VAR], int(tensors[_OBS_COUNT]), layout)
+    network = new_network(contract.network, options.model_copy(update={"critic": "policy"}))
+    blank = {
+        name: np.zeros_like(value)
+        for name, value in state_tensors(network).items()
+        if not name.startswith(_ACTING)
+    }
+    load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    return Policy(network, moments, contract)
+
+
+def _shape(contract: Contract) -> dict[str, Any]:
+    """Return what must be equal in the contracts of policies that are averaged."""
+    return {
+        "observation": [(part["name"], part["size"]) for part in contract.observation],
+        "network": contract.network,
+        "control_rate_hz": contract.task.control_rate_hz,
+        "robot": contract.task.robot,
+    }
+
+
+def mean_policy(policies: Sequence[Policy]) -> Policy:
+    """Return the policy with the mean of several policies' weights and observation moments: a model soup.
+
+    The mean of policies that were trained from the same one, in different ways, is often better than each of them
+    (Wortsman et al. 2022). It has the first one's contract, with the largest number of frames. ``made_with`` lists the
+    policies.
+
+    Raises:
+        PolicyError: They differ in observation, network, control rate or robot.
+    """
+    first = policies[0].contract
+    for policy in policies[1:]:
+        theirs, ours = (_shape(contract) for contract in (policy.contract, first))
+        for name, wanted in ours.items():
+            if theirs[name] != wanted:
+                raise PolicyError(f"no mean of policies that differ in {name}: {wanted} and {theirs[name]}")
+    share = 1.0 / len(policies)
+    states = [policy.network.state_dict() for policy in policies]
+    network = copy.deepcopy(policies[0].network)
+    network.load_state_dict({name: sum(state[name] for state in states) * share for name in states[0]})
+    moments = Moments(
+        sum((policy.moments.mean for policy in policies), np.zeros(())) * share,
+        sum((policy.moments.var for policy in policies), np.zeros(())) * share,
+        policies[0].moments.count,
+    )
+    parts = [
+        f"{p.contract.run} {p.contract.frames} frames, launch {p.contract.task.launch}" for p in policies
+    ]
+    contract = first.model_copy(
+        update={
+            "frames": max(policy.contract.frames for policy in policies),
+            "made_with": first.made_with | {"mean_of": "; ".join(parts)},
+        }
+    )
+    return Policy(network, moments, contract)

@@ -1,0 +1,1 @@
+"""What every service consists of: settings, log, metrics, process, connection, membership, run folder."""

@@ -1,0 +1,128 @@
+"""A service as a member of its run: liveliness token, heartbeat, control requests, refused messages.
+
+Every service has one. The heartbeat is a `Status`. The token shows that the service is alive; it
+disappears when the process ends.
+"""
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
+
+from common.comms.codec import DecodeError, decode_one_of, encode
+from common.comms.keys import Keys
+from common.comms.messages import ActorReport, Command, Control, ControlReply, Status, Verdict
+from common.comms.transport import AliveToken, Flow, Transport
+from common.service.metrics import Metrics
+from common.service.settings import ServiceConfig
+
+log = logging.getLogger(__name__)
+
+LEARNER_ID: Final = "0"  # a run has one learner
+CONTROL_MAILBOX: Final = 256  # requests that wait; more than all actors of a run send at once
+
+
+class Drops(Protocol):
+    """A server or subscription that counts what it dropped."""
+
+    @property
+    def dropped(self) -> int:
+        """Messages that a full mailbox dropped."""
+
+
+class Member:
+    """One life of a service.
+
+    Args:
+        role: generator, actor, learner or evaluator.
+        config: Run, name, and time between heartbeats.
+        transport: Connection to the hub.
+        metrics: Receives the service's numbers.
+        incarnation: Number of this life of the service.
+        id: Name among those of its role; default: the config's.
+    """
+
+    def __init__(
+        self,
+        role: str,
+        config: ServiceConfig,
+        transport: Transport,
+        metrics: Metrics,
+        incarnation: int,
+        *,
+        id: str = "",
+    ) -> None:
+        self.role, self.id, self.incarnation = role, id or config.id, incarnation
+        self.keys = Keys(config.run)
+        self.state = "waiting"
+        self.is_draining = False  # a drain was requested: finish the work in progress, then end
+        self._transport, self._metrics = transport, metrics
+        self._interval_s, self._next_status = config.status_interval_s, 0.0
+        self._control = transport.serve(self.keys.ctl(role, self.id), capacity=CONTROL_MAILBOX)
+        self._mailboxes: dict[str, tuple[Drops, ...]] = {"control": (self._control,)}
+        self._token: AliveToken | None = None
+
+    def join(self) -> None:
+        """Declare the liveliness token: the service can answer now."""
+        key = self.keys.alive(self.role, self.id, self.incarnation)
+        self._token = self._transport.declare_alive(key)
+
+    def watch(self, name: str, *mailboxes: Drops) -> None:
+        """Count what these mailboxes drop under ``name``."""
+        self._mailboxes[name] = mailboxes
+
+    def answer_control(self, report: Callable[[ActorReport], Verdict] | None = None) -> None:
+        """Answer the control requests that wait.
+
+        Args:
+            report: Answers an actor's report; None where actors do not report to this service.
+        """
+        allowed = (Control,) if report is None else (ActorReport, Control)
+        while (request := self._control.poll()) is not None:
+            try:
+                message = decode_one_of(request.payload, allowed)
+            except DecodeError as error:
+                self.refuse("control", error)
+                request.refuse()
+                continue
+            if isinstance(message, ActorReport) and report is not None:
+                request.reply(encode(report(message)))
+                continue
+            if isinstance(message, Control):
+                self.is_draining |= message.command is Command.DRAIN
+            request.reply(encode(ControlReply(True, self.state, "")))
+
+    def refuse(self, kind: str, reason: object) -> None:
+        """Count and log a message that can't be used."""
+        self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
+        log.warning("message refused kind=%s reason=%s", kind, reason)
+
+    def is_due(self, now: float) -> bool:
+        """Return whether a heartbeat is due at ``now`` [s], and count it as sent if so."""
+        if now < self._next_status:
+            return False
+        self._next_status = now + self._interval_s
+        return True
+
+    def beat(self, counters: Mapping[str, float], gauges: Mapping[str, float]) -> None:
+        """Publish a heartbeat with these numbers; gauges that are nan are left out."""
+        self._metrics.follow("topspin_reconnects_total", self._transport.reconnect_count)
+        for name, mailboxes in self._mailboxes.items():
+            dropped = sum(mailbox.dropped for mailbox in mailboxes)
+            self._metrics.follow("topspin_messages_dropped_total", dropped, key=name)
+        status = Status(
+            role=self.role,
+            id=self.id,
+            incarnation=self.incarnation,
+            time=time.time(),
+            state=self.state,
+            counters={name: float(value) for name, value in counters.items()},
+            gauges={name: float(value) for name, value in gauges.items() if not math.isnan(value)},
+        )
+        self._transport.publish(self.keys.status(self.role, self.id), encode(status), Flow.STATUS)
+
+    def leave(self) -> None:
+        """Withdraw the liveliness token."""
+        if self._token is not None:
+            self._token.close()

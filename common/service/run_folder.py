@@ -1,0 +1,168 @@
+"""A run's folder: its paths, its locks, and its tables, which may be read while a service writes them."""
+
+import csv
+import errno
+import fcntl
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from common.errors import ReportedError
+
+log = logging.getLogger(__name__)
+
+RUNS = Path("runs")
+LATEST = "latest"
+
+Holder = Literal["learner", "deploy.local"]
+LOCKS: Final[dict[Holder, str]] = {"deploy.local": ".deploy.lock", "learner": ".lock"}
+"""The lock file of each writer of a run folder. There are two, since deploy.local starts a learner and both hold their
+lock at the same time."""
+_NO_LOCKS: Final = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)  # a file system without locks
+
+
+class RunAliveError(ReportedError):
+    """Another process uses the run folder: one line that names it."""
+
+
+def whole_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a run's CSV file, by column; none where there is no file.
+
+    An incomplete line at the end is left out: it is being written, or its writer was killed.
+    """
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        lines = [line for line in file if line.endswith("\n")]
+    return [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Paths of one run."""
+
+    root: Path
+
+    @staticmethod
+    def of(run: str, folder: str = "") -> "RunFolder":
+        """Return the folder of a run: runs/RUN unless another is given."""
+        return RunFolder(Path(folder) if folder else RUNS / run)
+
+    @property
+    def config(self) -> Path:
+        """Every setting of the run."""
+        return self.root / "config.toml"
+
+    @property
+    def metrics(self) -> Path:
+        """One row an epoch."""
+        return self.root / "metrics.csv"
+
+    @property
+    def tensorboard(self) -> Path:
+        """TensorBoard events."""
+        return self.root / "tb"
+
+    @property
+    def checkpoints(self) -> Path:
+        """Checkpoints, from which --resume continues."""
+        return self.root / "checkpoints"
+
+    @property
+    def latest_policy(self) -> Path:
+        """The newest policy."""
+        return self.root / "policy" / "latest"
+
+    @property
+    def best_policy(self) -> Path:
+        """The best policy by evaluation."""
+        return self.root / "policy" / "best"
+
+    @property
+    def logs(self) -> Path:
+        """One log a process."""
+        return self.root / "logs"
+
+    @property
+    def report(self) -> Path:
+        """Evaluations and reports."""
+        return self.root / "report"
+
+    @property
+    def evaluations(self) -> Path:
+        """The evaluator's curve: one row an evaluation."""
+        return self.report / "evaluations.csv"
+
+    def create(self) -> None:
+        """Make the folders."""
+        for path in (self.tensorboard, self.checkpoints, self.latest_policy.parent, self.logs, self.report):
+            path.mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def held_by(self, holder: Holder) -> Iterator[None]:
+        """Hold the lock of ``holder`` on the folder. The kernel releases it when the process ends, also after a crash.
+
+        Raises:
+            RunAliveError: Another process holds it.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        # Child processes must not inherit the file: the lock lives as long as any process has it open.
+        file = self._open(holder, os.O_RDWR | os.O_CREAT)
+        try:
+            self._take(file, fcntl.LOCK_EX, holder)
+            os.truncate(file, 0)
+            os.write(file, f"{os.getpid()}\n".encode())
+            yield
+        finally:
+            os.close(
+                file
+            )  # the file stays: removing it could remove a lock that another process has just taken
+
+    def check_free_of(self, holder: Holder) -> None:
+        """Raise RunAliveError if a ``holder`` uses the folder; nothing is written."""
+        try:
+            file = self._open(holder, os.O_RDONLY)
+        except FileNotFoundError:
+            return
+        try:
+            self._take(file, fcntl.LOCK_SH, holder)
+        finally:
+            os.close(file)
+
+    def _lock(self, holder: Holder) -> Path:
+        return self.root / LOCKS[holder]
+
+    def _open(self, holder: Holder, how: int) -> int:
+        try:
+            return os.open(self._lock(holder), how | os.O_CLOEXEC, 0o644)
+        except PermissionError as error:
+            raise ReportedError(f"can't open {self._lock(holder)}: {error.strerror}") from None
+
+    def _take(self, file: int, how: int, holder: Holder) -> None:
+        try:
+            fcntl.flock(file, how | fcntl.LOCK_NB)
+        except BlockingIOError:
+            process = self._lock(holder).read_text().strip() or "that is just starting"
+            raise RunAliveError(
+                f"run {self.root.name!r} is alive: {holder}, process {process}, uses {self.root}; "
+                "end it first, or choose another --run"
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            log.warning(
+                "can't be locked folder=%s reason=%s: make sure that no other process uses it",
+                self.root,
+                error.strerror,
+            )
+
+    def point_latest_here(self) -> None:
+        """Point runs/latest to this run."""
+        link = self.root.parent / LATEST
+        fresh = link.with_name(f".{LATEST}-{os.getpid()}")
+        fresh.symlink_to(self.root.name)
+        os.replace(fresh, link)

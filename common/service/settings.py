@@ -1,0 +1,57 @@
+"""Settings that every service has: its run, its name, the hub's address, the address of its metrics."""
+
+import os
+import time
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.comms.zenoh_config import LinkConfig, ZenohConfig
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+
+class RunSettings(LinkConfig):
+    """Settings that are the same for all services of a run."""
+
+    run: str = Field("default", description="run that the service belongs to; part of every key")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of all random numbers of the run")
+    metrics_host: str = Field("127.0.0.1", description="address that /metrics is served on")
+    log_level: LogLevel = Field("info", description="lowest level that is logged")
+    status_interval_s: float = Field(
+        1.0, gt=0, le=60, description="time between heartbeats", json_schema_extra={"unit": "s"}
+    )
+
+
+class ServiceConfig(RunSettings, ZenohConfig):
+    """Settings of one service's process."""
+
+    id: str = Field("0", exclude=True, description="name of this service among those of its role")
+    metrics_port: int = Field(
+        0, ge=0, le=65535, exclude=True, description="HTTP port of /metrics; 0: any free one"
+    )
+
+
+class Fleet(BaseModel):
+    """How many services a run has."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    actors: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="actors of the run: a dataset is one rollout of each, and they share 256 environments",
+    )
+    generators: int = Field(1, ge=1, le=100, description="generators of the run")
+    shards: int = Field(0, ge=0, le=4096, description="streams of rallies; 0: one for each actor")
+
+    @property
+    def shard_count(self) -> int:
+        """Number of streams of rallies."""
+        return self.shards or self.actors
+
+
+def new_incarnation() -> int:
+    """Return a number that is larger in every later life of a service: milliseconds since 1970, then the process id."""
+    return int(time.time() * 1000) * 2**10 + os.getpid() % 2**10

@@ -1,0 +1,99 @@
+"""The task's settings, said once. A policy's contract holds them, and a hash of them keeps learner and actors alike."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.physics.constants import GRID_STEP
+from common.physics.flight import Flight
+from common.task.launch_presets import PresetName
+from common.task.observation import ObservationConfig
+from common.task.reward import RewardConfig
+
+RobotName = Literal["rails", "usst"]
+FlightName = Literal["simple", "full"]
+Randomization = Literal["off", "standard", "hard"]
+Perception = Literal["cheap", "full"]
+
+
+class PlayConditions(BaseModel):
+    """Conditions under which a policy plays. They may differ from those of its training."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    randomization: Randomization = Field(
+        "standard",
+        description="how much air, table, rubber, drives, latency and noise differ from rally to rally",
+    )
+    perception: Perception = Field(
+        "cheap",
+        description="what the robot measures of the ball: cheap: its true state, late and noisy; full: the estimate of "
+        "the camera filter, from the detections of a simulated camera",
+    )
+
+
+class MatchConditions(PlayConditions):
+    """Conditions of a match against balls from a launch preset."""
+
+    launch: PresetName = Field("paper", description="launch preset of the balls")
+    rounds: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="most rallies of an episode; it continues while the robot returns the ball",
+    )
+    collision: Literal["tailored", "original"] = Field(
+        "tailored",
+        description="contacts of the ball: tailored: ours, exact in time, with measured laws; original: MuJoCo's own, "
+        "half as fast",
+    )
+    time_limit_s: float = Field(
+        2.5,
+        gt=0.1,
+        le=60,
+        description="longest rally; a longer one is truncated",
+        json_schema_extra={"unit": "s"},
+    )
+
+
+class TaskConfig(MatchConditions):
+    """What the task is: robot, control rate, balls, randomization, perception, rules, observation and reward."""
+
+    robot: RobotName = Field(
+        "rails",
+        description="rails: our robot; usst: the same with the published joint speeds of the authors' robot",
+    )
+    control_rate_hz: Literal[25, 50, 100, 200] = Field(
+        50, description="control steps a second", json_schema_extra={"unit": "Hz"}
+    )
+    flight: FlightName = Field("simple", description="aerodynamics of the ball")
+    carry_over: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="share of episodes in which the robot starts where the last stroke left it",
+    )
+    reset_spread: float = Field(
+        0.1,
+        ge=0,
+        le=0.5,
+        description="in the other episodes each joint starts at home, plus or minus up to this",
+        json_schema_extra={"unit": "m, rad"},
+    )
+    reward: RewardConfig = RewardConfig()
+    observation: ObservationConfig = ObservationConfig()
+
+    @property
+    def flight_model(self) -> Flight:
+        """The aerodynamics as the kernels name them."""
+        return Flight[self.flight.upper()]
+
+    @property
+    def grid_steps(self) -> int:
+        """Steps of the flight's grid in one control step."""
+        return round(1.0 / (self.control_rate_hz * GRID_STEP))
+
+    def under(self, conditions: PlayConditions) -> "TaskConfig":
+        """Return the task with all settings of ``conditions``; every other setting stays."""
+        names = type(conditions).model_fields.keys() & MatchConditions.model_fields.keys()
+        return self.model_copy(update={name: getattr(conditions, name) for name in names})

@@ -1,0 +1,90 @@
+"""The paper's reward: R, one literal table, and the penalty e_r.
+
+    reward = one-hot(tau) R[stage] - e_r
+
+The paper prints a plus before e_r. All coefficients of e_r are positive, so a plus would reward torque and jitter.
+Every entry of R is a sum of a constant and four features:
+
+    g        1/(1 + d_rb^2)^2, d_rb the distance of racket and ball [m]
+    speed    x velocity of the racket's contact point just before the contact, clipped to 0..10 m/s
+    aim      1/(1 + d_bt^2)^2, d_bt the distance of ball and target in space [m]
+    landing  1/(1 + (e_lt/s)^2)^2, e_lt the planar landing error [m], s the length scale (1 m in the paper)
+"""
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+
+from common.task.states import State
+
+FEATURES = ("constant", "g", "speed", "aim", "landing")
+
+_0 = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+# fmt: off
+R: dict[State, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] = {
+    #              stage 1: catch                 stage 2: hit                   stage 3: aim
+    #              const   g   speed aim land
+    State.TAU_0:  (_0,                            _0,                            _0),
+    State.TAU_01: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),   (0.0,  0.1, 0.0, 0.0, 0.0)),
+    State.TAU_1:  ((10.0, 0.0, 0.0, 0.0, 0.0),    (4.0,  0.0,  0.0, 0.0, 0.0),   (1.0,  0.0, 0.0, 0.0, 0.0)),
+    State.TAU_12: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),   (0.0,  0.1, 0.0, 0.0, 0.0)),
+    State.TAU_2:  ((25.0, 0.0, 0.0, 0.0, 0.0),    (50.0, 0.0,  1.0, 0.0, 0.0),   (10.0, 0.0, 0.0, 0.0, 0.0)),
+    State.TAU_23: (_0,                            _0,                            (0.0,  0.0, 0.0, 1.0, 0.0)),
+    State.TAU_3:  (_0,                            _0,                            (30.0, 0.0, 0.0, 0.0, 40.0)),
+    State.TAU_30: (_0,                            _0,                            _0),
+}
+# fmt: on
+
+TERMS = ("catch_approach", "bounce", "contact", "aim", "landing", "torque", "jitter", "collision")
+"""Names of the reward's terms, in the order of kernels and rollouts."""
+
+
+class RewardConfig(BaseModel):
+    """The reward's settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    reference_rate_hz: float = Field(
+        50.0,
+        gt=0,
+        le=1000,
+        description="control rate at which the rewards of continuing states, torque and collision are not scaled",
+        json_schema_extra={"unit": "Hz"},
+    )
+    torque: float = Field(
+        0.02, ge=0, le=10, description="c: weight of sum |T_i|/T_max,i", json_schema_extra={"unit": "-"}
+    )
+    jitter: float = Field(
+        0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"}
+    )
+    collision: float = Field(
+        0.1, ge=0, le=10, description="e: weight of sum min(F_c/50 N, 1)", json_schema_extra={"unit": "-"}
+    )
+    landing_scale: float = Field(
+        0.5,
+        gt=0,
+        le=10,
+        description="length scale s of the landing reward; 1 m in the paper",
+        json_schema_extra={"unit": "m"},
+    )
+    landing_bonus: float = Field(
+        100.0,
+        ge=0,
+        le=1000,
+        description="weight w of stage 3's bonus right after the contact: w/(1 + (e/s)^2), e the distance from the "
+        "predicted landing point to the target; half of it if the ball will not clear the net; 0 in the paper",
+        json_schema_extra={"unit": "-"},
+    )
+    landing_bonus_scale: float = Field(
+        0.5, gt=0, le=10, description="length scale s of the landing bonus", json_schema_extra={"unit": "m"}
+    )
+
+
+PAPER_REWARD = RewardConfig(landing_scale=1.0, landing_bonus=0.0)
+"""The reward as in the paper: R and e_r, without landing bonus."""
+
+
+def reward_table() -> npt.NDArray[np.float64]:
+    """Return R for the kernels (3, 8, 5): entry [stage - 1, state, feature]."""
+    return np.array([[R[state][stage] for state in State] for stage in range(3)])

@@ -1,0 +1,181 @@
+"""Preparing a run: its settings, its folder, its ports, and the processes that it needs."""
+
+import os
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final
+
+from pydantic import ValidationError
+
+from common.comms.keys import Keys
+from common.comms.zenoh_config import ZenohConfig
+from common.errors import ReportedError
+from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
+from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
+from deploy.config import CONNECT_S, DeployConfig
+from deploy.supervisor import Spec
+from services.learner.budget import ENDING_S, Budget
+
+SECTION: Final = "local"
+
+
+class RunFailedError(ReportedError):
+    """A process that the run needs has failed: one line with the last line of its log."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRun:
+    """A run that can start: its folder holds its settings, and this process has locked it."""
+
+    name: str
+    config: DeployConfig
+    folder: RunFolder
+    link: ZenohConfig  # how this process reaches the learner
+
+    def last_epoch(self) -> dict[str, str]:
+        """Return the last row of the run's metrics.csv; {} before anything is trained."""
+        return last_epoch(self.folder)
+
+    def spent(self) -> str:
+        """Return the limit that a resumed run had reached before, such as "10 of 10 minutes", or ""."""
+        last = self.last_epoch()
+        if not (self.config.resume and last):
+            return ""
+        budget = Budget(self.config.learner.curriculum.epochs, self.config.frames, self.config.minutes)
+        return budget.spent(int(last["epoch"]), int(last["frames"]), float(last["seconds"]), ENDING_S)
+
+    def specs(self) -> list[Spec]:
+        """Return the processes of the run: its topology, as one function."""
+        config = self.config
+        file = str(self.folder.config)
+        ports = iter(metrics_ports(config))
+
+        def service(role: str, index: int, *more: str) -> Spec:
+            arguments = ("--config", file, "--id", str(index), "--metrics-port", str(next(ports)), *more)
+            # The learner holds the run's state: the run ends with it, and --resume continues.
+            return Spec(f"{role}-{index}", role, (f"services.{role}", *arguments), restart=role != "learner")
+
+        # A run that was stopped before its first checkpoint starts from the beginning.
+        resumes = config.resume and any(self.folder.checkpoints.glob("*.safetensors"))
+        found = [service("learner", 0, *(("--resume",) if resumes else ()))]
+        if config.evaluate:
+            found.append(service("evaluator", 0))
+        found += [service("generator", i, "--index", str(i)) for i in range(config.generators)]
+        found += [service("actor", i, "--index", str(i)) for i in range(config.actors)]
+        return found
+
+
+def last_epoch(folder: RunFolder) -> dict[str, str]:
+    """Return the last row of a run's metrics.csv; {} before anything is trained."""
+    rows = whole_rows(folder.metrics)
+    return rows[-1] if rows else {}
+
+
+def metrics_ports(config: DeployConfig) -> list[int]:
+    """Return the port of each process's /metrics: learner, evaluator, generators, actors; 0 is any free one."""
+    count = 1 + config.evaluate + config.generators + config.actors
+    return [config.metrics_port + i if config.metrics_port else 0 for i in range(count)]
+
+
+def free_endpoint() -> str:
+    """Return a free endpoint on the loopback interface."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def settings(argv: Sequence[str], prog: str) -> DeployConfig:
+    """Return the settings of a run; a resumed one has those of its config.toml, except for flags given now."""
+    asked = first_look(DeployConfig, ("run", "resume"), argv, prog=prog, section=SECTION)
+    if not asked.resume:
+        if asked.run == LATEST:
+            raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
+        return load(DeployConfig, argv, prog=prog, section=SECTION)
+    if not asked.run:
+        newest = f": the newest run is {os.readlink(RUNS / LATEST)}" if (RUNS / LATEST).is_symlink() else ""
+        raise ConfigError(f"--resume needs --run NAME{newest}")
+    name = os.readlink(RUNS / LATEST) if asked.run == LATEST else asked.run
+    file = RunFolder.of(name).config
+    if not file.exists():
+        raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
+    if SECTION not in read_toml(file):
+        raise ConfigError(
+            f"run {name!r} was started service by service: {file} has no table [{SECTION}]; go on with: "
+            f"python -m services.learner --run {name} --resume"
+        )
+    resumed = load(DeployConfig, argv, prog=prog, section=SECTION, recorded=file)
+    return resumed.model_copy(update={"run": name})
+
+
+@contextmanager
+def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
+    """Yield a run that can start; no other process can run it meanwhile.
+
+    A resumed run whose new settings don't fit, and which fails before it has trained anything, keeps its old ones.
+    """
+    name = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
+    Keys(name)  # refuses a name that can't be part of a key; any other name can be a folder's
+    folder = RunFolder.of(name)
+    # Before the other checks: a live run would fail them too, but this error says more.
+    for holder in LOCKS:
+        folder.check_free_of(holder)
+    if folder.config.exists() and not config.resume:
+        raise ConfigError(
+            f"run {name!r} exists already in {folder.root}: go on with --resume, or choose another --run"
+        )
+    check_ports(config)
+    # A new endpoint each time unless one is set: the old one may be taken.
+    link = link_to_learner(config, config.endpoint or free_endpoint())
+    with folder.held_by("deploy.local"):
+        folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
+        before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
+        write(config, name, folder, link.endpoint)
+        try:
+            yield PreparedRun(name, config, folder, link)
+        except RunFailedError:
+            if before and last_epoch(folder) == trained:
+                save_settings(folder.config, before)
+            raise
+
+
+def write(config: DeployConfig, name: str, folder: RunFolder, endpoint: str) -> None:
+    """Create a run's folder, with its settings in config.toml."""
+    folder.create()
+    tables = to_tables(config, SECTION)
+    save_settings(folder.config, tables | {"run": name, "endpoint": endpoint})
+    folder.point_latest_here()
+
+
+def check_ports(config: DeployConfig) -> None:
+    """Raise ConfigError with the first port of /metrics that is taken: with it a service would fail at every start."""
+    for port in filter(None, metrics_ports(config)):
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+            try:
+                probe.bind((config.metrics_host, port))
+            except OSError as error:
+                raise ConfigError(
+                    f"port {port} can't be used: {error.strerror}; --metrics-port {config.metrics_port} needs "
+                    f"{len(metrics_ports(config))} free ports from there on"
+                ) from None
+
+
+def link_to_learner(config: DeployConfig, endpoint: str) -> ZenohConfig:
+    """Return how this process reaches the learner: as its services do.
+
+    Raises:
+        ConfigError: TLS needs all of ca, certificate and key, and an endpoint tls/...
+    """
+    try:
+        return ZenohConfig(
+            endpoint=endpoint,
+            tls_ca=config.tls_ca,
+            tls_certificate=config.tls_certificate,
+            tls_key=config.tls_key,
+            connect_timeout_s=CONNECT_S,
+        )
+    except ValidationError as error:
+        raise ConfigError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None

@@ -1,0 +1,173 @@
+"""Starting, watching, restarting and stopping the processes of a run."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from common.service.config import ENVIRONMENT_PREFIX
+from common.service.process import BAD_CONFIG
+from deploy.child import SPARE, Assignment
+
+log = logging.getLogger(__name__)
+
+RESTART_PAUSE_S = (
+    0.5  # first pause, so that a process that fails at its start is not restarted in a busy loop
+)
+RESTART_PAUSE_MAX_S = 30.0  # longest pause; it doubles with each failure
+STABLE_S = 20.0  # after this lifetime the pause is the first one again
+SPARE_AFTER_S = 10.0  # then one process starts and waits to replace one that dies
+SPARE_ROLE = "actor"  # imports torch and MuJoCo, which takes 2 s of a whole core; a run has many actors
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A process to keep alive."""
+
+    name: str  # such as actor-0; also its log's name
+    role: str
+    arguments: tuple[str, ...]  # module and flags, as after python -m
+    restart: bool  # whether it comes back when it dies
+
+
+def restart_pause(deaths: int) -> float:
+    """Return how long to wait before a process that died ``deaths`` times in a row is started again [s]."""
+    return min(RESTART_PAUSE_S * 2.0 ** max(deaths - 1, 0), RESTART_PAUSE_MAX_S)
+
+
+@dataclass(slots=True)
+class Child:
+    """The state of one process."""
+
+    spec: Spec
+    process: subprocess.Popen[bytes]
+    started: float
+    restarts: int = 0
+    deaths_in_a_row: int = 0
+    restart_at: float | None = None
+    exits: list[int] = field(default_factory=list)
+
+
+class Supervisor:
+    """The processes of a run. ``watch`` must be called regularly.
+
+    Args:
+        specs: The processes.
+        logs: Folder for one log file per process.
+    """
+
+    def __init__(self, specs: list[Spec], logs: Path) -> None:
+        self._logs = logs
+        self._spare: subprocess.Popen[bytes] | None = None
+        self._next_spare = time.monotonic() + SPARE_AFTER_S
+        self.children = {spec.name: Child(spec, self._start(spec), time.monotonic()) for spec in specs}
+
+    def _start(self, spec: Spec) -> subprocess.Popen[bytes]:
+        log_file = self._logs / f"{spec.name}.log"
+        spare, self._spare = (self._spare, None) if spec.role == SPARE_ROLE else (None, self._spare)
+        if spare is not None and spare.poll() is None and spare.stdin is not None:
+            with suppress(BrokenPipeError):
+                spare.stdin.write(Assignment(str(log_file), spec.arguments[1:]).to_line())
+                spare.stdin.flush()
+                return spare
+        return _launch(spec.arguments, log_file)
+
+    def watch(self, now: float) -> None:
+        """Record which processes ended, and restart those with ``restart``."""
+        if self._spare is None and now >= self._next_spare:
+            module = next(
+                (c.spec.arguments[0] for c in self.children.values() if c.spec.role == SPARE_ROLE), ""
+            )
+            if module:
+                self._spare = _launch((SPARE, module), self._logs / "spare.log")
+        for child in self.children.values():
+            status = child.process.poll()
+            if status is None:
+                continue
+            if child.restart_at is None and len(child.exits) == child.restarts:
+                child.exits.append(status)
+                if not child.spec.restart or status == BAD_CONFIG:
+                    continue
+                child.deaths_in_a_row = 1 if now - child.started > STABLE_S else child.deaths_in_a_row + 1
+                child.restart_at = now + restart_pause(child.deaths_in_a_row)
+                log.warning(
+                    "process died name=%s pid=%d status=%d last_line=%r; restarting it",
+                    child.spec.name,
+                    child.process.pid,
+                    status,
+                    self.last_line(child.spec.name),
+                )
+            if child.restart_at is not None and now >= child.restart_at:
+                _close_pipe(child.process)
+                child.process = self._start(child.spec)
+                child.started, child.restart_at = now, None
+                child.restarts += 1
+
+    def has_bad_config(self) -> str:
+        """Return the name of a process whose settings can't be used, so that no restart helps, or ""."""
+        return next((n for n, c in self.children.items() if c.exits and c.exits[-1] == BAD_CONFIG), "")
+
+    def last_line(self, name: str) -> str:
+        """Return the last line of a process's log."""
+        lines = (self._logs / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+    def status_of(self, name: str) -> int | None:
+        """Return a process's exit status, or None while it runs."""
+        return self.children[name].process.poll()
+
+    def stop(self, names: list[str], patience_s: float) -> None:
+        """Send SIGTERM to processes, and kill those that do not end in time; the first call also ends the spare."""
+        if self._spare is not None:
+            self._spare.kill()  # it has no state
+            self._spare.wait()
+            _close_pipe(self._spare)
+            self._spare, self._next_spare = None, float("inf")
+        running = [
+            self.children[name].process for name in names if self.children[name].process.poll() is None
+        ]
+        for process in running:
+            process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + patience_s
+        for process in running:
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                log.warning("process pid=%d did not end within %.0f s and is killed", process.pid, patience_s)
+                process.kill()
+                process.wait()
+        for name in names:
+            _close_pipe(self.children[name].process)
+
+
+def _launch(arguments: Sequence[str], log_file: Path) -> subprocess.Popen[bytes]:
+    with log_file.open("ab") as output:
+        # One thread each: with more, numerics libraries on every process fight for the same cores.
+        # No settings from the environment: all settings of the run are in its config.toml.
+        environment = {
+            name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT_PREFIX)
+        }
+        environment |= {
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+        }
+        return subprocess.Popen(
+            [sys.executable, "-m", "deploy.child", *arguments],
+            stdin=subprocess.PIPE,  # stays open: it closes when this process ends, and then the child ends
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            env=environment,
+            start_new_session=True,  # a Ctrl-C reaches only this process, which stops the others in order
+        )
+
+
+def _close_pipe(process: subprocess.Popen[bytes]) -> None:
+    if process.stdin is not None:
+        process.stdin.close()

@@ -1,0 +1,63 @@
+"""Following a run by its heartbeats."""
+
+import logging
+from typing import Final
+
+from common.comms.codec import DecodeError, decode
+from common.comms.keys import Keys
+from common.comms.messages import Status
+from common.comms.transport import Transport
+from deploy.panel import STALE_S, View, clock, time_left_s
+
+log = logging.getLogger(__name__)
+
+LINE_INTERVAL_S: Final = 15.0  # between progress lines when there is no terminal
+
+
+class Watcher:
+    """Follows the heartbeats of a run, and logs lines of progress.
+
+    Args:
+        view: Updated; a panel shows it.
+        transport: Connection to the hub.
+    """
+
+    def __init__(self, view: View, transport: Transport) -> None:
+        self._view = view
+        self._statuses = transport.subscribe(Keys(view.run).every_status(), capacity=4096)
+        self._next_line = 0.0
+
+    def look(self, now: float) -> None:
+        """Read the heartbeats that have arrived."""
+        for sample in self._statuses.poll():
+            try:
+                self._view.hear(decode(sample.payload, Status), now)
+            except DecodeError as error:
+                log.warning("status refused reason=%s", error)
+
+    def line(self, now: float) -> None:
+        """Log a line of progress if one is due."""
+        learner = self._view.statuses.get(("learner", "0"))
+        if now < self._next_line or learner is None:
+            return
+        self._next_line = now + LINE_INTERVAL_S
+        g, c = learner.gauges, learner.counters
+        measured = self._view.statuses.get(("evaluator", "0"))
+        evaluated = measured.gauges if measured else {}
+        alive = sum(now - heard < STALE_S for heard in self._view.heard.values())
+        log.info(
+            "progress stage=%d frames=%d frames_per_s=%.0f catch=%.3f return=%.3f error=%.2f reward=%.1f lag=%.2f "
+            "evaluation_catch=%.3f evaluation_return=%.3f alive=%d left=%s",
+            g.get("stage", 0),
+            c.get("frames", 0),
+            g.get("frames_per_s", 0),
+            g.get("catch_rate", float("nan")),
+            g.get("return_rate", float("nan")),
+            g.get("target_error", float("nan")),
+            g.get("reward", float("nan")),
+            g.get("lag", float("nan")),
+            evaluated.get("catch_rate", float("nan")),
+            evaluated.get("return_rate", float("nan")),
+            alive,
+            clock(time_left_s(self._view)),
+        )

@@ -1,0 +1,117 @@
+"""What the learner broadcasts, and answers on request: its newest policy and the stage changes so far."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from common.comms.codec import encode
+from common.comms.keys import Keys
+from common.comms.messages import AVERAGE, PolicySnapshot, StageChange, StageLog
+from common.comms.transport import Flow, Transport
+from common.policy.actor_critic import ActorCritic
+from common.policy.weights import pack
+from services.learner.training import Training
+
+log = logging.getLogger(__name__)
+
+MAILBOX: Final = 256  # requests that wait
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The fields that identify the sender of policies and stage changes."""
+
+    run: str
+    generation: int  # number of this life of the learner
+    contract_hash: str
+    training_hash: str
+
+
+class Broadcast:
+    """Publishes policies and stage changes, and answers requests for them.
+
+    Args:
+        transport: Connection to the hub.
+        keys: The run's keys.
+        training: Holds network, moments and progress.
+        identity: Fields of every message.
+        stages: Stage changes of earlier lives.
+    """
+
+    def __init__(
+        self,
+        transport: Transport,
+        keys: Keys,
+        training: Training,
+        identity: Identity,
+        stages: Sequence[StageChange] = (),
+    ) -> None:
+        self._transport, self._keys, self._training, self._identity = transport, keys, training, identity
+        self.stages = list(stages)
+        self._blob = self._average = b""
+        self._policies = transport.serve(keys.policy(), capacity=MAILBOX)
+        self._stage_log = transport.serve(keys.stage(), capacity=MAILBOX)
+        if not self.stages:
+            self.note_stage("start")
+
+    def publish_policy(self) -> None:
+        """Broadcast the newest version."""
+        self._blob = self._snapshot(self._training.network)
+        self._average = b""  # made on request
+        self._transport.publish(self._keys.policy(), self._blob, Flow.POLICY)
+
+    def note_stage(self, reason: str) -> None:
+        """Append the present stage to the stage log."""
+        progress = self._training.progress
+        change = StageChange(
+            run=self._identity.run,
+            generation=self._identity.generation,
+            number=progress.stage_number,
+            stage=progress.stage,
+            frames=progress.frames,
+            epoch=progress.epoch,
+            reason=reason,
+        )
+        self.stages.append(change)
+        log.info(
+            "stage number=%d stage=%d frames=%d reason=%s", change.number, change.stage, change.frames, reason
+        )
+
+    def publish_stage(self) -> None:
+        """Broadcast the newest stage change."""
+        self._transport.publish(self._keys.stage(), encode(self.stages[-1]), Flow.STAGE)
+
+    def answer(self) -> None:
+        """Answer the requests that wait."""
+        while (request := self._policies.poll()) is not None:
+            request.reply(self._averaged() if request.payload == AVERAGE else self._blob)
+        while (request := self._stage_log.poll()) is not None:
+            request.reply(encode(StageLog(tuple(self.stages))))
+
+    def _averaged(self) -> bytes:
+        """Return the newest version with the running mean of the weights."""
+        if not self._average:
+            self._average = self._snapshot(self._training.average)
+        return self._average
+
+    def _snapshot(self, network: ActorCritic) -> bytes:
+        """Return the newest version with the weights of ``network``, encoded."""
+        training, progress, identity = self._training, self._training.progress, self._identity
+        return encode(
+            PolicySnapshot(
+                run=identity.run,
+                generation=identity.generation,
+                version=progress.version,
+                stage_number=progress.stage_number,
+                stage=progress.stage,
+                epoch=progress.epoch,
+                frames=progress.frames,
+                contract_hash=identity.contract_hash,
+                training_hash=identity.training_hash,
+                weights=pack(network),
+                obs_mean=training.obs_moments.mean,
+                obs_var=training.obs_moments.var,
+                obs_count=training.obs_moments.count,
+            )
+        )

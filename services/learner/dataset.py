@@ -1,0 +1,205 @@
+"""From rollouts to the update's data: one pass over the rollouts computes all that an epoch needs."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from common.comms.messages import Rollout
+from common.env.teacher import COMING, MEMORY_JOINTS
+from common.policy.actor_critic import ActorCritic, log_prob
+from common.policy.normalizer import Moments, normalize
+from common.task.experience import TeacherConfig
+from common.task.observation import OBSERVATION, offsets
+from services.learner.advantage import gae
+from services.learner.bptt import ArmRollout
+from services.learner.differentiable_arm import ArmModel
+from services.learner.epoch_stats import PlayStats, play_stats
+from services.learner.ppo import Dataset, PPOConfig, arithmetic, denormalized, explained_variance
+
+Floats = npt.NDArray[np.float32]
+
+_JOINTS: Final = slice(offsets(OBSERVATION)["joint_pos"].start, offsets(OBSERVATION)["joint_vel"].stop)
+MEMORY_WEIGHT: Final = 3.0  # added to 1: the memory is in differences of a tenth of a joint's usual deviation
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """The network before its update, with the moments that normalise its inputs and values."""
+
+    network: ActorCritic
+    obs_moments: Moments
+    value_moments: Moments
+    obs_size: int
+    ppo: PPOConfig
+
+    def values(self, obs: Floats) -> Floats:
+        """Return the critic's values [reward] of observations (N, D)."""
+        if len(obs) == 0:
+            return np.zeros(0, np.float32)
+        with arithmetic(self.ppo.precision):
+            _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
+        return denormalized(value.float(), self.value_moments)
+
+
+@dataclass(frozen=True, slots=True)
+class Distillation:
+    """How an epoch uses a teacher's corrections."""
+
+    teacher: TeacherConfig
+    is_on: bool  # the policy still imitates the teacher
+    arm: ArmModel | None  # None: gradients do not pass through the arm
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """All that an epoch needs of its rollouts."""
+
+    data: Dataset
+    explained: float  # explained variance of the values before the update
+    value_moments: Moments  # after these returns
+    obs_moments: tuple[Moments, ...]  # of each rollout's raw observations
+    play: PlayStats
+    lag: float  # mean of (version now - version that played)
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One rollout, flattened to n frames."""
+
+    obs: Tensor  # (n, D) normalised
+    actions: Tensor  # (n, A)
+    log_mu: Tensor  # (n,)
+    log_prox: Tensor  # (n,)
+    mean: Tensor  # (n, A)
+    corrections: Tensor  # (n, A)
+    correction_weights: Tensor  # (n, A)
+    advantages: Floats  # (n,)
+    values: Floats  # (n,)
+    moments: Moments  # of the raw observations
+    joints: Floats  # (n, 14) joint positions and velocities
+    ended: npt.NDArray[np.bool_]  # (n,)
+    shape: tuple[int, int]  # (T, B)
+
+
+def read(
+    rollouts: Sequence[Rollout],
+    model: Model,
+    distillation: Distillation,
+    version: int,
+    on_tick: Callable[[], None] = lambda: None,
+) -> Batch:
+    """Return the update's data: normalised by the frozen moments, with pi_prox and the critic computed again.
+
+    Args:
+        rollouts: The dataset; blocks may differ in shape. Their order decides the result's bits.
+        model: Network and moments before the update.
+        distillation: The teacher.
+        version: Of the policy before the update.
+        on_tick: Called between rollouts.
+    """
+    log_std = model.network.log_std.detach().clone()
+    parts = []
+    for rollout in rollouts:
+        parts.append(_part(rollout, model, distillation, log_std))
+        on_tick()
+    values = np.concatenate([part.values for part in parts])
+    advantage = np.concatenate([part.advantages for part in parts])
+    target = advantage + values
+    explained = explained_variance(target, values)
+    moments = model.value_moments.merged(Moments.of(target))
+    scale = np.sqrt(moments.var + 1e-5)
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    actions = torch.cat([part.actions for part in parts])
+    data = Dataset(
+        obs=torch.cat([part.obs for part in parts]),
+        actions=actions,
+        log_mu=torch.cat([part.log_mu for part in parts]),
+        log_prox=torch.cat([part.log_prox for part in parts]),
+        mean_prox=torch.cat([part.mean for part in parts]),
+        log_std_prox=log_std,
+        advantages=torch.from_numpy(advantage),
+        value_targets=torch.from_numpy(((target - moments.mean) / scale).astype(np.float32)),
+        corrections=torch.cat([part.corrections for part in parts]),
+        correction_weights=torch.cat([part.correction_weights for part in parts]),
+        motion=_arm_rollout(parts, actions, distillation, model.obs_moments),
+    )
+    return Batch(
+        data=data,
+        explained=explained,
+        value_moments=moments,
+        obs_moments=tuple(part.moments for part in parts),
+        play=play_stats(rollouts),
+        lag=float(np.mean([version - rollout.version for rollout in rollouts])),
+        frames=len(actions),
+    )
+
+
+@torch.no_grad()
+def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor) -> _Part:
+    ppo, steps, count = model.ppo, *r.rewards.shape
+    obs = torch.from_numpy(normalize(r.obs, model.obs_moments).reshape(-1, model.obs_size))
+    actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
+    with arithmetic(ppo.precision):
+        mean, value = model.network(obs)
+    mean, value = mean.float(), value.float()
+    values = denormalized(value, model.value_moments).reshape(steps, count)
+    final = np.zeros(steps * count, np.float32)
+    final[r.final_index] = model.values(r.final_obs)
+    advantage = gae(
+        r.rewards * np.float32(ppo.reward_scale),
+        values,
+        r.terminated,
+        r.truncated,
+        final.reshape(steps, count),
+        model.values(r.last_obs),
+        ppo.gamma,
+        ppo.gae_lambda,
+    )
+    # A teacher's last corrections arrive when the policy already learns from rewards. They are not hit corrections.
+    is_late = distillation.teacher.teaches(r.version) and not distillation.is_on
+    corrections = np.zeros_like(r.corrections) if is_late else r.corrections
+    raw = r.obs.reshape(-1, model.obs_size)
+    return _Part(
+        obs=obs,
+        actions=actions,
+        log_mu=torch.tensor(r.log_mu.reshape(-1)),
+        log_prox=log_prob(actions, mean, log_std),
+        mean=mean,
+        corrections=torch.tensor(corrections.reshape(-1, corrections.shape[-1])),
+        correction_weights=torch.from_numpy(_weights(r, distillation)).reshape(-1, r.actions.shape[-1]),
+        advantages=advantage.reshape(-1),
+        values=values.reshape(-1),
+        moments=Moments.of(raw),
+        joints=raw[:, _JOINTS],
+        ended=(r.terminated | r.truncated).reshape(-1),
+        shape=(steps, count),
+    )
+
+
+def _weights(rollout: Rollout, distillation: Distillation) -> Floats:
+    """Return the weights of the corrections (T, B, A): larger where the arm is used as memory."""
+    weights = np.ones_like(rollout.actions)
+    if distillation.is_on and distillation.teacher.arm_memory:
+        weights[..., MEMORY_JOINTS] += MEMORY_WEIGHT * rollout.obs[..., COMING, None]
+    return weights
+
+
+def _arm_rollout(
+    parts: Sequence[_Part], actions: Tensor, distillation: Distillation, moments: Moments
+) -> ArmRollout | None:
+    """Return the arms' motion under a dataset's actions (N, A), or None if gradients do not pass through the arm."""
+    if distillation.arm is None or not distillation.is_on:
+        return None
+    frames = torch.split(torch.arange(len(actions)), [len(part.actions) for part in parts])
+    rows = tuple(some.reshape(part.shape) for some, part in zip(frames, parts, strict=True))
+    joints = np.concatenate([part.joints for part in parts])
+    ended = np.concatenate([part.ended for part in parts])
+    return ArmRollout.of(
+        distillation.arm, rows, torch.from_numpy(joints), actions, torch.from_numpy(ended), moments
+    )

@@ -1,0 +1,122 @@
+"""The learner's metrics and heartbeat, from an epoch's stats, the ledger and the intake."""
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+from common.service.metrics import Metrics
+from common.task.reward import TERMS
+from common.task.states import Outcome
+from services.learner.epoch_stats import EpochStats, Progress
+from services.learner.intake import Intake
+from services.learner.ledger import Ledger
+
+_MEMBERS: Final = ("generator", "actor", "evaluator")
+
+
+def epoch_gauges(stats: EpochStats, frames_per_s: float) -> dict[str, float]:
+    """Return an epoch's figures as the heartbeat shows them."""
+    play, update = stats.play, stats.update
+    return {
+        "frames_per_s": frames_per_s,
+        "catch_rate": play.catch_rate,
+        "return_rate": play.return_rate,
+        "target_error": play.target_error,
+        "reward": play.mean_return,
+        "lag": stats.lag,
+        "kl": update.kl,
+        "learning_rate": update.learning_rate,
+        "explained_variance": update.explained_variance,
+    }
+
+
+def measure_epoch(metrics: Metrics, stats: EpochStats, frames_per_s: float, update_s: float) -> None:
+    """Put an epoch into the metrics.
+
+    Args:
+        metrics: Written.
+        stats: The epoch's.
+        frames_per_s: Trained since the last epoch.
+        update_s: Duration of the update [s].
+    """
+    play, update, progress = stats.play, stats.update, stats.progress
+    metrics.inc("topspin_frames_total", stats.frames)
+    metrics.inc("topspin_episodes_total", int(play.outcomes.sum()))
+    metrics.inc("topspin_phase_seconds_total", update_s, phase="update")
+    metrics.observe("topspin_update_seconds", update_s)
+    for outcome in Outcome:
+        if outcome is not Outcome.NONE and play.outcomes[outcome]:
+            count = int(play.outcomes[outcome])
+            metrics.inc("topspin_outcomes_total", count, outcome=outcome.name.lower())
+    for name, value in {
+        "topspin_frames_per_second": frames_per_s,
+        "topspin_catch_rate": play.catch_rate,
+        "topspin_over_rate": play.over_rate,
+        "topspin_return_rate": play.return_rate,
+        "topspin_target_error_meters": play.target_error,
+        "topspin_episode_reward": play.mean_return,
+        "topspin_policy_version": progress.version,
+        "topspin_policy_lag": stats.lag,
+        "topspin_stage": progress.stage,
+        "topspin_epoch": progress.epoch,
+        "topspin_learning_rate": update.learning_rate,
+        "topspin_kl": update.kl,
+        "topspin_clip_fraction": update.clip_fraction,
+        "topspin_entropy": update.entropy,
+        "topspin_policy_loss": update.policy_loss,
+        "topspin_correction_loss": update.correction_loss,
+        "topspin_value_loss": update.value_loss,
+        "topspin_explained_variance": update.explained_variance,
+        "topspin_gradient_norm": update.gradient_norm,
+    }.items():
+        metrics.set(name, value)
+    for name, term in zip(TERMS, play.reward_terms, strict=True):
+        metrics.set("topspin_reward_per_frame", float(term), term=name)
+
+
+def fates(ledger: Ledger) -> dict[str, int]:
+    """Return the ledger's counts by fate."""
+    return {
+        "published": ledger.published,
+        "trained": ledger.trained,
+        "refused": sum(ledger.refused.values()),
+        "dropped": ledger.dropped,
+        "in_flight": ledger.in_flight,
+        "lost": ledger.lost,
+    }
+
+
+def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Iterable[str]) -> None:
+    """Put ledger, queue and membership into the metrics; ``alive`` holds the role of each live service."""
+    for fate, count in fates(ledger).items():
+        metrics.set("topspin_ledger_rollouts", count, fate=fate)
+    metrics.set("topspin_queue_depth", intake.queued)
+    metrics.set("topspin_rollout_gaps", intake.gaps())
+    roles = list(alive)
+    for role in _MEMBERS:
+        metrics.set("topspin_alive", roles.count(role), role=role)
+
+
+def heartbeat(
+    progress: Progress, epochs: int, seconds: float, ledger: Ledger, queued: int, last: Mapping[str, float]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return counters and gauges of the learner's heartbeat.
+
+    Args:
+        progress: Of training.
+        epochs: Of the whole curriculum.
+        seconds: Training time, through restarts [s].
+        ledger: Of all actors.
+        queued: Rollouts that wait for an update.
+        last: ``epoch_gauges`` of the newest epoch.
+    """
+    counters = {"frames": float(progress.frames)} | {k: float(v) for k, v in fates(ledger).items()}
+    gauges = {
+        "epoch": progress.epoch,
+        "epochs": epochs,
+        "version": progress.version,
+        "stage": progress.stage,
+        "queued": queued,
+        "seconds": seconds,
+        **last,
+    }
+    return counters, gauges

@@ -1,0 +1,60 @@
+"""A learner that diverges goes back to a checkpoint, or ends with one line."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+from services.learner.checkpoint import checkpoints
+from services.learner.service import DivergedError
+from tests.integration.in_process_run import LONG, local_run, progress, wait_until
+
+
+def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):
+    with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=0.2) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        good = tmp_path / "checkpoints" / "good"
+        wait_until(lambda: good.exists() and any(good.iterdir()), 60, "a good checkpoint")
+        with torch.no_grad():
+            learner.service.training.network.mean.weight[:] = float("nan")
+        wait_until(lambda: learner.metric("topspin_rollbacks_total") == 1, 30, "a rollback")
+        version = progress(learner).version
+        wait_until(lambda: progress(learner).version > version + 2, 30, "epochs after it")
+        weights = learner.service.training.network.mean.weight
+
+    assert progress(learner).rollbacks == 1
+    assert bool(weights.isfinite().all())
+
+
+def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
+    with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        begun = LONG.stage_1 + LONG.stage_2
+        wait_until(lambda: progress(learner).epoch > begun, 60, "stage 3")
+        kept = [path.stem for path in checkpoints(tmp_path / "checkpoints" / "good")]
+
+    assert kept == [f"{begun:08d}"]
+
+
+def test_a_run_that_diverges_without_a_good_checkpoint_ends_with_one_line(tmp_path):
+    with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        policy = tmp_path / "policy" / "latest"  # the last file of a save
+        wait_until(policy.exists, 60, "a checkpoint")
+        wait_until(lambda n=progress(learner).epoch: progress(learner).epoch > n, 30, "an epoch after it")
+        shutil.rmtree(tmp_path / "checkpoints" / "good", ignore_errors=True)
+        with torch.no_grad():
+            learner.service.training.network.mean.weight[:] = float("nan")
+        with pytest.raises(DivergedError, match="no good checkpoint to go back to"):
+            learner.join(30)
+        newest = checkpoints(tmp_path / "checkpoints")[-1]
+
+    assert bool(np.isfinite(load_file(newest)["network.mean.weight"]).all())

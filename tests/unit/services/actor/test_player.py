@@ -1,0 +1,282 @@
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from common.comms.messages import PolicySnapshot
+from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections
+from common.env.rally_env import Launches
+from common.policy.actor_critic import NetworkConfig
+from common.policy.contract import PolicyError, contract_hash
+from common.policy.folder import load_policy
+from common.policy.normalizer import normalize
+from common.policy.weights import new_network, observation_moments, pack
+from common.rally.hit_correction import BACK
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
+from common.task.launch import draw_rallies
+from common.task.observation import critic_layout, policy_layout, size
+from services.actor.player import Player, correct
+from tests.unit.env.teachers import write_teacher
+
+ENVS, HORIZON = 6, 40
+NETWORK = NetworkConfig(units=(16, 8))
+OBSERVATION = TaskConfig().observation
+SIZE = size(critic_layout(OBSERVATION))
+CONFIG = TaskConfig(time_limit_s=0.5)  # some rallies end in time, some are truncated
+
+
+class Dealer:
+    """Gives a generator's rallies, every third one marked as not validated."""
+
+    def __init__(self):
+        self.block = draw_rallies(1600, seed=5)
+        self.dealt = 0
+
+    def take(self, count):
+        rows = np.arange(self.dealt, self.dealt + count)
+        self.dealt += count
+        return Launches(self.block.launches[rows], self.block.seeds[rows], rows % 3 > 0)
+
+
+def make_player(seed=1):
+    return Player(CONFIG, ExperienceConfig(), NETWORK, Dealer(), ENVS, HORIZON, seed)
+
+
+def make_snapshot(player, seed=2, **changes):
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    snapshot = PolicySnapshot(
+        run="r",
+        generation=4,
+        version=7,
+        stage_number=1,
+        stage=2,
+        epoch=7,
+        frames=1000,
+        contract_hash=contract_hash(CONFIG, NETWORK),
+        training_hash=player.training_hash,
+        weights=pack(new_network(NETWORK, OBSERVATION)),
+        obs_mean=rng.normal(size=SIZE) * 0.1,
+        obs_var=rng.uniform(0.5, 2.0, SIZE),
+        obs_count=100,
+    )
+    return dataclasses.replace(snapshot, **changes)
+
+
+def played(seed=1, sequence=3):
+    player = make_player(seed)
+    player.adopt(make_snapshot(player))
+    return player, player.play("a", 9, sequence)
+
+
+@pytest.fixture(scope="module")
+def block():
+    return played()[1]
+
+
+def test_a_block_names_its_actor_and_policy(block):
+    stamps = ("run", "generation", "version", "stage_number", "actor", "incarnation", "sequence")
+
+    assert [getattr(block, name) for name in stamps] == ["r", 4, 7, 1, "a", 9, 3]
+    assert block.obs.shape == (HORIZON, ENVS, SIZE)
+    assert block.fault() == ""
+
+
+def test_its_log_mu_is_that_of_the_policy_at_its_observations(block):
+    player = make_player()
+    snapshot = make_snapshot(player)
+    player.adopt(snapshot)
+    network = player._network
+    moments = observation_moments(
+        snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, critic_layout(OBSERVATION)
+    )
+    with torch.no_grad():
+        mean, _ = network(torch.from_numpy(normalize(block.obs.reshape(-1, SIZE), moments)))
+        normal = torch.distributions.Normal(mean, network.log_std.exp())
+        log_mu = normal.log_prob(torch.from_numpy(block.actions.reshape(-1, 7))).sum(-1)
+
+    # float32 sums over 7 terms in another order
+    np.testing.assert_allclose(block.log_mu.reshape(-1), log_mu.numpy(), atol=2e-4)
+
+
+def test_only_the_policy_acts_and_it_observes_only_its_own_part(block):
+    player = make_player()
+    snapshot = make_snapshot(player)
+    hidden = np.arange(SIZE) >= player._network.obs_size  # the critic's additional numbers
+    assert hidden.any()
+    player.adopt(dataclasses.replace(snapshot, obs_mean=np.where(hidden, 1e3, snapshot.obs_mean)))
+    player._network.value = player._network.judge = None
+
+    np.testing.assert_array_equal(player.play("a", 9, 3).actions, block.actions)
+
+
+def test_a_truncated_rally_keeps_its_real_last_observation_at_its_step(block):
+    cut = np.flatnonzero(block.truncated)
+
+    assert cut.size > 0
+    np.testing.assert_array_equal(block.final_index, cut)
+    assert block.final_obs.shape == (cut.size, SIZE)
+    following = np.concatenate((block.obs[1:], block.last_obs[None])).reshape(-1, SIZE)[cut]
+    # after it another rally begins: its first observation is not the last of this one
+    assert (np.abs(block.final_obs - following).max(axis=1) > 1e-3).all()
+    assert not (block.terminated & block.truncated).any()
+
+
+def test_episodes_list_every_rally_that_ended(block):
+    ended = int((block.terminated | block.truncated).sum())
+
+    assert len(block.episodes.outcome) >= ended > 0
+    assert 0 < block.episodes.unvalidated.sum() < len(block.episodes.outcome)
+    np.testing.assert_allclose(block.reward_terms.sum(), block.rewards.sum(dtype=np.float64), rtol=1e-4)
+
+
+def test_the_same_seed_and_number_play_the_same_block_bit_for_bit_and_others_another(block):
+    again, other_number, other_seed = played()[1], played(sequence=4)[1], played(seed=2)[1]
+
+    for field in dataclasses.fields(block):
+        if field.name not in ("seconds", "episodes"):
+            np.testing.assert_array_equal(getattr(block, field.name), getattr(again, field.name), field.name)
+    assert not np.array_equal(block.actions, other_number.actions)
+    assert not np.array_equal(block.actions, other_seed.actions)
+
+
+def test_the_next_block_continues_where_the_last_one_ended():
+    player, first = played()
+
+    second = player.play("a", 9, 4)
+
+    np.testing.assert_array_equal(second.obs[0], first.last_obs)
+
+
+def test_a_policy_of_another_task_or_with_unusable_weights_is_refused_and_the_old_one_kept():
+    player, _ = played()
+    before = {name: value.clone() for name, value in player._network.state_dict().items()}
+    nan = new_network(NETWORK, OBSERVATION)
+    with torch.no_grad():
+        next(nan.parameters()).fill_(float("nan"))
+
+    for changes, message in (
+        ({"training_hash": "other"}, "start both with the same"),
+        ({"weights": b"rubbish"}, "not readable as safetensors"),
+        ({"weights": pack(nan)}, "are not finite"),
+        ({"weights": pack(new_network(NetworkConfig(units=(16, 9)), OBSERVATION))}, "have shape"),
+        ({"obs_mean": np.zeros(3), "obs_var": np.ones(3)}, r"shapes \(3,\)"),
+    ):
+        with pytest.raises(PolicyError, match=message):
+            player.adopt(make_snapshot(player, version=8, **changes))
+
+    assert player.snapshot is not None
+    assert player.snapshot.version == 7
+    for name, value in player._network.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def make_hits(*hits, seed=0):
+    """Return hit_corrections of random numbers for (row, steps)."""
+    rng = np.random.default_rng(seed)
+    rows, steps = np.array(hits).T
+    return HitCorrections(rows, rng.normal(size=(len(rows), BACK, 7)).astype(np.float32), steps)
+
+
+def test_a_correction_is_at_its_control_step_and_robot():
+    corrections = np.zeros((20, 4, 7), np.float32)
+    hit_corrections = make_hits((2, BACK), (0, 3))
+    correct(corrections, 15, hit_corrections)
+    expected = np.zeros_like(corrections)
+    for k, (row, steps) in enumerate([(2, BACK), (0, 3)]):
+        for back in range(steps):
+            expected[15 - back, row] = hit_corrections.corrections[k, back]
+
+    np.testing.assert_array_equal(corrections, expected)
+
+
+def test_corrections_before_the_blocks_start_are_lost():
+    corrections = np.zeros((20, 4, 7), np.float32)
+    hit_corrections = make_hits((1, BACK))
+    correct(corrections, 2, hit_corrections)
+
+    np.testing.assert_array_equal(corrections[[2, 1, 0], 1], hit_corrections.corrections[0, :3])
+    np.testing.assert_array_equal(corrections[3:], 0.0)
+
+
+def test_a_step_without_hits_leaves_the_corrections():
+    corrections = np.ones((20, 4, 7), np.float32)
+    correct(corrections, 15, NO_HIT_CORRECTIONS)
+
+    np.testing.assert_array_equal(corrections, 1.0)
+
+
+def struck_block(monkeypatch, stage=3, **experience):
+    """Return a block of 512 robots near home, some of which the ball hits, and the hit corrections by step."""
+    player = Player(CONFIG, ExperienceConfig(**experience), NETWORK, Dealer(), 512, HORIZON, 1)
+    torch.manual_seed(0)
+    network = new_network(NETWORK, OBSERVATION, player.env.home_action)
+    with torch.no_grad():
+        network.mean.bias[0] = 1.2  # the first joint's action is clipped, and gets no correction
+    player.adopt(make_snapshot(player, stage=stage, weights=pack(network)))
+    hit_corrections, step = [], player.env.step
+
+    def recorded(actions):
+        result = step(actions)
+        hit_corrections.append(result.hit_corrections)
+        return result
+
+    monkeypatch.setattr(player.env, "step", recorded)
+    return player.play("a", 9, 3), hit_corrections
+
+
+def test_a_blocks_corrections_are_its_hits_except_where_an_action_was_clipped(monkeypatch):
+    block, hit_corrections = struck_block(monkeypatch)
+    expected = np.zeros_like(block.corrections)
+    for t, hits in enumerate(hit_corrections):
+        for row, correction, steps in zip(hits.rows, hits.corrections, hits.steps, strict=True):
+            for back in range(min(steps, t + 1)):
+                for joint in range(7):
+                    if abs(block.actions[t - back, row, joint]) < 1.0:
+                        expected[t - back, row, joint] = correction[back, joint]
+                    else:
+                        expected[t - back, row, joint] = 0.0
+
+    assert sum(hits.rows.size for hits in hit_corrections) > 3
+    assert block.corrections.dtype == np.float32
+    assert (np.abs(block.actions) >= 1.0).any()
+    np.testing.assert_array_equal(block.corrections, expected)
+
+
+@pytest.mark.parametrize(("stage", "changes"), [(1, {}), (2, {}), (3, {"hit_correction": False})])
+def test_without_hit_correction_and_outside_stage_3_there_are_no_corrections(monkeypatch, stage, changes):
+    block, _ = struck_block(monkeypatch, stage, **changes)
+
+    assert block.episodes.caught.any()
+    assert block.corrections.shape == block.actions.shape
+    np.testing.assert_array_equal(block.corrections, 0.0)
+
+
+@pytest.mark.parametrize("version", [6, 7])
+def test_during_distillation_all_corrections_are_the_teachers(tmp_path, version):
+    teacher = write_teacher(tmp_path / "t").model_copy(update={"epochs": 7})
+    experience = ExperienceConfig(teacher=teacher)
+    player = Player(CONFIG, experience, NETWORK, Dealer(), 64, HORIZON, 1)
+    torch.manual_seed(0)
+    home = pack(new_network(NETWORK, OBSERVATION, player.env.home_action))
+    player.adopt(make_snapshot(player, stage=3, version=version, weights=home))
+    block = player.play("a", 9, 3)
+
+    assert block.episodes.caught.any()
+    if version < 7:
+        seen = block.obs[..., : size(policy_layout(OBSERVATION))]
+        advised = [load_policy(tmp_path / "t").act(obs).clip(-1, 1) for obs in seen]
+        np.testing.assert_allclose(block.actions + block.corrections, advised, atol=1e-6)
+    else:
+        alone = Player(CONFIG, ExperienceConfig(), NETWORK, Dealer(), 64, HORIZON, 1)
+        alone.adopt(make_snapshot(alone, stage=3, version=version, weights=home))
+        untaught = alone.play("a", 9, 3)
+        assert (untaught.corrections != 0.0).any()
+        np.testing.assert_array_equal(block.corrections, untaught.corrections)
+
+
+def test_play_needs_a_policy_first():
+    with pytest.raises(RuntimeError, match="there is no policy yet"):
+        make_player().play("a", 1, 0)

@@ -1,0 +1,311 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from common.policy.actor_critic import NetworkConfig, log_prob
+from common.policy.weights import new_network
+from services.learner.ppo import (
+    Dataset,
+    LearningRate,
+    PPOConfig,
+    UpdateMode,
+    adapted_learning_rate,
+    bound_loss,
+    correction_loss,
+    explained_variance,
+    policy_loss,
+    update,
+)
+
+
+def column(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def test_the_loss_of_a_hand_worked_case():
+    # ratios 1.5 (clipped to 1.2), 0.5 (not clipped: the advantage is negative, and min takes 0.8), 1.1
+    log_prox = column(0.0, 0.0, 0.0)
+    log_new = torch.log(column(1.5, 0.5, 1.1))
+    advantages = column(2.0, -1.0, 3.0)
+
+    loss = policy_loss(log_new, log_prox, log_prox, advantages, clip=0.2)
+
+    # min(1.5*2, 1.2*2) = 2.4; min(0.5*-1, 0.8*-1) = -0.8; 1.1*3 = 3.3
+    assert float(loss) == pytest.approx(-(2.4 - 0.8 + 3.3) / 3)
+
+
+def test_old_data_are_weighted_by_how_likely_they_still_are_at_most_twice():
+    log_mu = column(0.0, 0.0)
+    log_prox = torch.log(column(0.5, 8.0))
+
+    loss = policy_loss(log_prox, log_prox, log_mu, column(1.0, 1.0), clip=0.2)
+
+    assert float(loss) == pytest.approx(-(0.5 + 2.0) / 2)
+
+
+def test_at_lag_0_decoupled_ppo_is_plain_ppo():
+    rng = np.random.default_rng(0)
+    log_mu = torch.from_numpy(rng.normal(size=200))
+    log_new = (log_mu + torch.from_numpy(rng.normal(size=200)) * 0.3).requires_grad_()
+    advantages = torch.from_numpy(rng.normal(size=200))
+
+    ratio = torch.exp(log_new - log_mu)
+    plain = -torch.min(ratio * advantages, torch.clamp(ratio, 0.8, 1.2) * advantages).mean()
+    decoupled = policy_loss(log_new, log_mu, log_mu, advantages, clip=0.2)
+
+    torch.testing.assert_close(decoupled, plain)
+    torch.testing.assert_close(
+        torch.autograd.grad(decoupled, log_new)[0], torch.autograd.grad(plain, log_new)[0]
+    )
+
+
+def test_the_loss_of_targets_beyond_the_joints_range_is_their_squared_excess():
+    mean = torch.tensor([[0.5, -1.0, 1.5], [-3.0, 0.0, 0.0]])
+
+    assert float(bound_loss(mean)) == pytest.approx((0.25 + 4.0) / 2)
+
+
+@pytest.mark.parametrize(
+    ("kl", "expected"), [(0.05, 4e-4 / 1.5), (0.001, 6e-4), (0.01, 4e-4), (1.0, 4e-4 / 1.5)]
+)
+def test_the_learning_rate_follows_the_divergence(kl, expected):
+    assert adapted_learning_rate(4e-4, kl, 1e-4, 1e-3, target=0.01) == pytest.approx(expected)
+
+
+def test_the_learning_rate_stays_within_its_bounds():
+    assert adapted_learning_rate(1e-4, 1.0, 1e-4, 1e-3, target=0.01) == 1e-4
+    assert adapted_learning_rate(1e-3, 0.0, 1e-4, 1e-3, target=0.01) == 1e-3
+
+
+def test_explained_variance_is_1_for_perfect_and_0_for_constant_values():
+    targets = np.random.default_rng(0).normal(size=100).astype(np.float32)
+
+    assert explained_variance(targets, targets) == pytest.approx(1.0)
+    assert explained_variance(targets, np.zeros(100, np.float32)) == pytest.approx(0.0, abs=1e-6)
+
+
+def make_data(network, count=512, seed=0):
+    """A bandit: the first action component should rise wherever the first observation is positive."""
+    generator = torch.Generator().manual_seed(seed)
+    obs = torch.randn(count, 37, generator=generator)
+    with torch.no_grad():
+        mean, _ = network(obs)
+        log_std = network.log_std.clone()
+        actions = mean + log_std.exp() * torch.randn(mean.shape, generator=generator)
+        log_mu = log_prob(actions, mean, log_std)
+    advantages = (actions[:, 0] - mean[:, 0]) * torch.sign(obs[:, 0])
+    advantages = (advantages - advantages.mean()) / advantages.std()
+    nothing = torch.zeros_like(mean)
+    return Dataset(
+        obs,
+        actions,
+        log_mu,
+        log_mu.clone(),
+        mean,
+        log_std,
+        advantages,
+        obs[:, 1].clone(),
+        nothing,
+        torch.ones_like(mean),
+    )
+
+
+def test_an_update_moves_the_policy_where_the_advantage_points_and_fits_the_value():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    config = PPOConfig(minibatch=128, mini_epochs=4)
+    stats = [
+        update(
+            network,
+            optimizer,
+            make_data(network, seed=k),
+            config,
+            LearningRate(1e-3, 1e-3),
+            torch.Generator().manual_seed(k),
+        )
+        for k in range(25)
+    ]
+
+    probe = make_data(network, seed=99)
+    positive = probe.obs[:, 0] > 0
+    assert probe.mean_prox[positive, 0].mean() - probe.mean_prox[~positive, 0].mean() > 0.1
+    assert stats[-1].value_loss < 0.5 * stats[0].value_loss
+    assert stats[0].weight == pytest.approx(1.0)
+    assert all(s.finite for s in stats)
+
+
+def test_critic_only_fits_the_value_and_leaves_the_actions():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    data = make_data(network)
+    config = PPOConfig(minibatch=128, mini_epochs=8)
+
+    for k in range(10):
+        stats = update(
+            network,
+            optimizer,
+            data,
+            config,
+            LearningRate(1e-3, 1e-3),
+            torch.Generator().manual_seed(k),
+            mode=UpdateMode.CRITIC_ONLY,
+        )
+
+    with torch.no_grad():
+        mean, value = network(data.obs)
+    assert torch.equal(mean, data.mean_prox)
+    assert torch.equal(network.log_std, data.log_std_prox)
+    assert float((value - data.value_targets).square().mean()) < 0.9 * float(data.value_targets.var())
+    assert stats.learning_rate == 1e-3
+
+
+def test_a_gradient_that_is_not_finite_is_skipped_and_reported():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(16,)))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    data = make_data(network, count=64)
+    data.advantages[:] = float("nan")
+
+    stats = update(
+        network,
+        torch.optim.Adam(network.parameters()),
+        data,
+        PPOConfig(minibatch=64, mini_epochs=1),
+        LearningRate(1e-3, 1e-3),
+        torch.Generator(),
+    )
+
+    assert not stats.finite
+    for name, value in network.state_dict().items():
+        assert torch.equal(value, before[name])
+
+
+def make_corrections(count=512, share=0.2, seed=0):
+    """Return corrections (count, 7): some rows, and in each of them some joints."""
+    rng = np.random.default_rng(seed)
+    rows = rng.uniform(size=(count, 1)) < share
+    return torch.from_numpy((0.1 * rng.normal(size=(count, 7)) * rows).astype(np.float32))
+
+
+def test_the_correction_loss_is_half_the_weighted_mean_squared_distance_from_the_corrected_actions():
+    rng = np.random.default_rng(1)
+    mean, mean_prox = (torch.from_numpy(rng.normal(size=(50, 7))) for _ in range(2))
+    says = torch.from_numpy(rng.uniform(size=(50, 7)))
+    corrections = make_corrections(50).double()
+    total = 0.0
+    for row in range(50):
+        if any(corrections[row, joint] != 0 for joint in range(7)):
+            for joint in range(7):
+                wanted = mean_prox[row, joint] + corrections[row, joint]
+                total += 0.5 * float(says[row, joint]) * float(mean[row, joint] - wanted) ** 2
+
+    assert 0 < int((corrections != 0).any(-1).sum()) < 50
+    assert float(correction_loss(mean, mean_prox, corrections, says)) == pytest.approx(total / 50)
+
+
+def test_rows_without_correction_have_no_gradient():
+    mean = torch.randn(50, 7, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    corrections = make_corrections(50)
+    correction_loss(mean, torch.zeros(50, 7), corrections, torch.ones(50, 7)).backward()
+    silent = (corrections == 0).all(-1)
+
+    assert mean.grad is not None
+    assert (mean.grad[silent] == 0).all()
+    assert (mean.grad[~silent] != 0).all()
+
+
+def updated(corrections, weight, advantages=1.0, passes=2):
+    """Return the network after updates with these corrections, its dataset and the last statistics."""
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    data = make_data(network)
+    data = replace(data, corrections=corrections, advantages=advantages * data.advantages)
+    config = PPOConfig(minibatch=128, mini_epochs=passes, correction_weight=weight)
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    stats = update(
+        network, optimizer, data, config, LearningRate(1e-3, 1e-3), torch.Generator().manual_seed(0)
+    )
+    return network, data, stats
+
+
+def test_without_weight_or_corrections_it_is_plain_ppo_bit_for_bit():
+    plain, _, _ = updated(torch.zeros(512, 7), weight=0.0)
+    unweighted, _, _ = updated(make_corrections(), weight=0.0)
+    uncorrected, _, stats = updated(torch.zeros(512, 7), weight=1000.0)
+
+    assert stats.correction_loss == 0.0
+    for a, b, c in zip(plain.parameters(), unweighted.parameters(), uncorrected.parameters(), strict=True):
+        assert torch.equal(a, b)
+        assert torch.equal(a, c)
+
+
+def test_an_update_moves_the_mean_towards_the_corrections():
+    corrections = make_corrections() + 0.0
+    corrections[(corrections != 0).any(-1)] = torch.tensor([0.1, -0.1, 0.05, 0.0, 0.0, 0.1, -0.05])
+    network, data, stats = updated(corrections, weight=1000.0, passes=8)
+    says = (corrections != 0).any(-1)
+    with torch.no_grad():
+        moved = (network(data.obs)[0] - data.mean_prox)[says]
+    before, after = (float((m - corrections[says]).square().sum(-1).mean()) for m in (0.0 * moved, moved))
+
+    assert after < 0.5 * before
+    assert float((moved * corrections[says]).sum(-1).mean()) > 0
+    assert stats.correction_loss > 0
+
+
+def test_a_distilled_policy_learns_the_teachers_actions_and_nothing_from_rewards():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    wanted = torch.full((7,), 0.3)
+    config = PPOConfig(minibatch=128, mini_epochs=4)
+
+    def distilled(seed):
+        data = make_data(network, seed=seed)
+        data = replace(data, corrections=wanted - data.actions)  # for any action
+        return data, update(
+            network,
+            optimizer,
+            data,
+            config,
+            LearningRate(2e-3, 1e-4),
+            torch.Generator().manual_seed(seed),
+            mode=UpdateMode.DISTILL,
+        )
+
+    first, stats = distilled(0)
+    for seed in range(1, 30):
+        last = distilled(seed)[1]
+
+    with torch.no_grad():
+        mean, _ = network(make_data(network, seed=99).obs)
+    torch.testing.assert_close(mean, wanted.expand_as(mean), atol=0.03, rtol=0)
+    assert torch.equal(network.log_std, first.log_std_prox)
+    assert stats.policy_loss == 0.0
+    assert stats.learning_rate == 2e-3  # no trust region changes it
+    assert last.correction_loss < 0.01 * stats.correction_loss
+    assert last.value_loss < stats.value_loss
+
+
+def test_critic_only_applies_no_correction():
+    torch.manual_seed(0)
+    network = new_network(NetworkConfig(units=(32, 32)))
+    data = replace(make_data(network), corrections=make_corrections())
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    stats = update(
+        network,
+        optimizer,
+        data,
+        PPOConfig(minibatch=128),
+        LearningRate(1e-3, 1e-3),
+        torch.Generator().manual_seed(0),
+        mode=UpdateMode.CRITIC_ONLY,
+    )
+
+    with torch.no_grad():
+        assert torch.equal(network(data.obs)[0], data.mean_prox)
+    assert stats.correction_loss == 0.0

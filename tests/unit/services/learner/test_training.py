@@ -1,0 +1,339 @@
+import csv
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from common.comms.messages import Episodes
+from common.policy.actor_critic import NetworkConfig
+from common.policy.normalizer import Moments, normalize
+from common.task.experience import TeacherConfig
+from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
+from services.learner.curriculum import CurriculumConfig
+from services.learner.differentiable_arm import ArmModel
+from services.learner.epoch_stats import play_stats
+from services.learner.ppo import PPOConfig
+from services.learner.run_log import RunLog, row
+from services.learner.training import Training
+from tests.unit.services.learner.rollouts import make_rollout
+
+PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_epochs=1)
+CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=50)
+EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_seconds=1.5)
+
+
+def make_training(seed=0):
+    return Training(PPO, NetworkConfig(units=(16, 8)), CURRICULUM, np.zeros(7, np.float32), seed)
+
+
+def dataset(epoch):
+    return [make_rollout(10 * epoch), make_rollout(10 * epoch + 1)]
+
+
+def state(training):
+    return [value.clone() for value in training.network.state_dict().values()]
+
+
+def assert_same(one, other):
+    assert one.progress == other.progress
+    for a, b in zip(state(one), state(other), strict=True):
+        assert torch.equal(a, b)
+    for which in ("obs_moments", "value_moments"):
+        a, b = getattr(one, which), getattr(other, which)
+        np.testing.assert_array_equal(a.mean, b.mean)
+        np.testing.assert_array_equal(a.var, b.var)
+        assert a.count == b.count
+
+
+def test_the_same_data_train_the_same_policy_bit_for_bit():
+    one, other = make_training(), make_training()
+    for epoch in range(4):
+        one.run_epoch(dataset(epoch))
+        other.run_epoch(dataset(epoch))
+
+    assert_same(one, other)
+    assert one.progress.frames == 4 * 2 * 16 * 8
+
+
+def test_an_update_uses_the_normaliser_of_its_actors():
+    training = make_training()
+    rollouts = dataset(0)
+    frozen = training.obs_moments
+
+    data = training.read(rollouts).data
+    training.run_epoch(rollouts)
+
+    np.testing.assert_array_equal(frozen.mean, 0.0)  # at the start only the clip has an effect
+    expected = np.clip(rollouts[0].obs.reshape(-1, 37), -5, 5)
+    np.testing.assert_allclose(data.obs[: len(expected)].numpy(), expected, rtol=1e-4)
+    every = np.concatenate([r.obs.reshape(-1, 37) for r in rollouts]).astype(np.float64)
+    merged = Moments.initial(37).merged(Moments.of(every))
+    np.testing.assert_allclose(training.obs_moments.mean, merged.mean, atol=1e-12)
+    np.testing.assert_allclose(training.obs_moments.var, merged.var, rtol=1e-12)
+
+
+def test_a_stage_change_carries_weights_over_and_resets_the_observation_count_alone():
+    training = make_training()
+    for epoch in range(2):
+        training.run_epoch(dataset(epoch))
+    assert training.datasets_left == 1
+    weights, values = state(training), training.value_moments.count
+
+    stats = training.run_epoch(dataset(2))
+
+    assert stats.stage_changed
+    assert (training.progress.stage, training.progress.stage_number, training.progress.epochs_in_stage) == (
+        2,
+        1,
+        0,
+    )
+    assert training.obs_moments.count == 1
+    assert training.value_moments.count > values
+    assert any(not torch.equal(a, b) for a, b in zip(weights, state(training), strict=True))
+
+
+def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
+    raw = 0.3 * make_rollout(77).obs.reshape(-1, 37)
+
+    def outputs(training):
+        with torch.no_grad():
+            return training.network(torch.from_numpy(normalize(raw, training.obs_moments)))
+
+    curriculum = CURRICULUM.model_copy(update={"stage_2": 50})
+
+    def moved(refit_epochs):
+        ppo = PPO.model_copy(
+            update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
+        )
+        training = Training(ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
+        for epoch in range(3):
+            training.run_epoch(dataset(epoch))
+        before, value_before = outputs(training)
+        telling = [replace(r, rewards=10 * r.actions[..., 0]) for r in dataset(3)]
+        for _ in range(4):
+            training.run_epoch(telling)
+        after, value_after = outputs(training)
+        return float((after - before).square().mean()), float((value_after - value_before).square().mean())
+
+    held, held_value = moved(refit_epochs=4)
+    free, free_value = moved(refit_epochs=0)
+
+    assert held < 1e-9  # rounding, as the normaliser changes
+    assert free > 1e-5
+    assert held_value > 1e-4
+    assert free_value > 1e-4
+
+
+def test_a_resumed_run_continues_bit_for_bit(tmp_path):
+    straight, before, after = make_training(), make_training(), make_training(seed=99)
+    for epoch in range(4):
+        straight.run_epoch(dataset(epoch))
+        before.run_epoch(dataset(epoch))
+    path = save(tmp_path, before, EXTRAS)
+    extras = restore(path, after)
+    for epoch in range(4, 8):
+        straight.run_epoch(dataset(epoch))
+        after.run_epoch(dataset(epoch))
+
+    assert extras == EXTRAS
+    assert_same(straight, after)
+
+
+def test_only_the_newest_checkpoints_are_kept(tmp_path):
+    training = make_training()
+    for epoch in range(5):
+        training.run_epoch(dataset(epoch))
+        save(tmp_path, training, EXTRAS)
+
+    assert [path.stem for path in checkpoints(tmp_path)] == ["00000003", "00000004", "00000005"]
+    assert not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "no checkpoint"),
+        (lambda path: path.write_bytes(b"rubbish"), "not readable"),
+        (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not readable"),
+        (lambda path: reword(path, '"format": 2', '"format": 9'), "has format 9; allowed is 2"),
+    ],
+)
+def test_an_unusable_checkpoint_is_refused_with_one_line(tmp_path, damage, message):
+    training = make_training()
+    training.run_epoch(dataset(0))
+    path = save(tmp_path, training, EXTRAS)
+    damage(path)
+
+    with pytest.raises(CheckpointError, match=message) as caught:
+        restore(path, make_training())
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_checkpoint_of_another_network_is_refused_with_the_parameter_that_differs(tmp_path):
+    path = save(tmp_path, make_training(), EXTRAS)
+    other = Training(PPO, NetworkConfig(units=(16, 9)), CURRICULUM, np.zeros(7, np.float32), 0)
+
+    with pytest.raises(CheckpointError, match=r"doesn't fit this configuration: weights '.*' have shape"):
+        restore(path, other)
+
+
+def reword(path, old, new):
+    """Change the header's text; it must keep its length."""
+    content = path.read_bytes()
+    old_bytes, new_bytes = json.dumps(old)[1:-1].encode(), json.dumps(new)[1:-1].encode()
+    assert content.count(old_bytes) == 1
+    path.write_bytes(content.replace(old_bytes, new_bytes))
+
+
+def test_unvalidated_balls_are_in_no_rate():
+    stats = play_stats([make_rollout(0), make_rollout(1)])
+
+    assert (stats.rallies, stats.unvalidated) == (8, 2)
+    assert (stats.caught, stats.over, stats.returned) == (4, 2, 2)
+    assert stats.error_sum == pytest.approx(0.4)
+    assert (stats.catch_rate, stats.over_rate, stats.return_rate) == (0.5, 0.25, 0.25)
+    assert stats.target_error == pytest.approx(0.2)
+    assert stats.outcomes.sum() == 8
+    np.testing.assert_allclose(stats.reward_terms, 2 * np.arange(8) / (2 * 16 * 8))
+
+
+def test_an_epoch_without_ended_rallies_has_nan_rates_in_the_log(tmp_path):
+    """No rally ended, or no validated one."""
+    training, record = make_training(), RunLog(tmp_path / "metrics.csv", tmp_path / "tb")
+    ended = make_rollout(0).episodes
+    for epoch, episodes in enumerate(
+        (
+            ended,
+            replace(ended, unvalidated=np.ones(5, bool)),
+            Episodes(**{field.name: getattr(ended, field.name)[:0] for field in fields(ended)}),
+        )
+    ):
+        record.append(row(training.run_epoch([make_rollout(epoch, episodes=episodes)]), 1.0, 100.0))
+    record.close()
+
+    with (tmp_path / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [line["rallies"] for line in rows] == ["4", "0", "0"]
+    for name in ("catch_rate", "over_rate", "return_rate", "target_error", "episode_return"):
+        values = [float(line[name]) for line in rows]
+        np.testing.assert_array_equal(np.isnan(values), [False, True, True], err_msg=name)
+
+
+def test_a_new_normaliser_does_not_change_what_a_later_stage_plays():
+    """The count's reset lets the moments jump; without compensation this alone destroys the old policy."""
+    training = make_training()
+    for epoch in range(3):
+        training.run_epoch(dataset(epoch))
+    assert training.progress.stage == 2
+    raw = 0.3 * make_rollout(77).obs.reshape(-1, 37)  # away from the clip
+    with torch.no_grad():
+        before = training.network(torch.from_numpy(normalize(raw, training.obs_moments)))[0]
+    moments = training.obs_moments
+    training.run_epoch(
+        [replace(r, obs=1.0 + 0.7 * r.obs) for r in dataset(3)]
+    )  # refitting: only the critic learns
+    with torch.no_grad():
+        after = training.network(torch.from_numpy(normalize(raw, training.obs_moments)))[0]
+
+    assert np.abs(training.obs_moments.mean - moments.mean).min() > 0.5
+    torch.testing.assert_close(after, before, atol=1e-3, rtol=0)
+
+
+def test_a_correction_stays_with_its_observation():
+    training = make_training()
+    rollouts = []
+    for rollout in dataset(0):
+        corrections = np.repeat(rollout.obs[..., :1], 7, axis=-1)
+        rollouts.append(replace(rollout, corrections=corrections))
+    data = training.read(rollouts).data
+
+    assert data.corrections.shape == data.actions.shape
+    raw = np.concatenate([r.obs.reshape(-1, 37) for r in rollouts])
+    np.testing.assert_array_equal(data.corrections.numpy(), np.repeat(raw[:, :1], 7, axis=1))
+    np.testing.assert_allclose(data.obs[:, 0].numpy(), np.clip(raw[:, 0], -5, 5), rtol=1e-4)
+
+
+def test_after_distillation_a_policy_learns_from_rewards_with_small_steps_and_no_late_corrections():
+    training = make_training()
+    training.teacher = TeacherConfig(policy="somewhere", epochs=2)
+    rollout = [make_rollout(k, corrections=np.ones((16, 8, 7), np.float32)) for k in range(2)]
+    rates = [training.run_epoch(rollout).update.learning_rate for _ in range(2)]
+    late = training.read([rollout[0], make_rollout(2, version=2, corrections=rollout[0].corrections)]).data
+    after = training.run_epoch(rollout).update
+
+    assert rates == pytest.approx(
+        [PPO.learning_rate, 0.5 * (PPO.learning_rate + PPO.learning_rate_min)]
+    )  # linear over the two epochs
+    np.testing.assert_array_equal(late.corrections[:128], 0.0)
+    np.testing.assert_array_equal(late.corrections[128:], 1.0)
+    assert after.correction_loss == 0.0
+    assert after.policy_loss != 0.0
+
+
+def distilling(**teacher):
+    """Return a training with two epochs of distillation, and a rollout with its corrections."""
+    training = make_training()
+    training.teacher = TeacherConfig(policy="somewhere", epochs=2, **teacher)
+    return training, make_rollout(0, corrections=np.ones((16, 8, 7), np.float32))
+
+
+def test_during_distillation_action_noise_can_be_bounded():
+    training, rollout = distilling(max_log_std=-4.0)
+    noises = []
+    for _ in range(3):
+        training.run_epoch([rollout])
+        noises.append(training.network.log_std.detach().clone())
+
+    assert (noises[0] == -4.0).all()
+    assert torch.equal(noises[1], noises[0])
+    assert (noises[2] > -4.01).all()  # PPO's own after that
+
+
+def test_corrections_of_the_arm_memory_have_more_weight_before_the_bounce():
+    training, rollout = distilling(arm_memory=True)
+    rollout.obs[..., 33:37] = 0.0
+    rollout.obs[:8, :, 33] = 1.0  # coming
+    rollout.obs[8:, :, 34] = 1.0  # bounced
+    weights = training.read([rollout]).data.correction_weights.numpy().reshape(16, 8, 7)
+
+    assert (weights[8:] == 1.0).all()
+    assert (weights[:8, :, :5] == 1.0).all()
+    assert (weights[:8, :, 5:] == 4.0).all()
+
+
+def test_gradients_pass_through_the_arm_during_distillation_and_not_from_rollout_to_rollout():
+    training, rollout = distilling()
+    training.arm = ArmModel()
+    motion = training.read([rollout, make_rollout(1, corrections=rollout.corrections)]).data.motion
+    updates = [training.run_epoch([rollout]).update for _ in range(2)]
+
+    assert motion is not None
+    assert [rows.shape for rows in motion.rows] == [(16, 8), (16, 8)]
+    assert motion.rows[0][3, 5] == 3 * 8 + 5
+    np.testing.assert_array_equal(motion.before[3 * 8 + 5], rollout.obs[3, 5, :14])
+    np.testing.assert_array_equal(motion.rows[1] - motion.rows[0], 16 * 8)
+    assert all(stats.finite and stats.correction_loss > 0 for stats in updates)
+    assert training.read([rollout]).data.motion is None  # the teacher's epochs are over
+
+
+@pytest.mark.parametrize("aiming_log_std", [-2.5, -1.0])
+def test_the_action_noise_is_bounded_from_stage_3_on_and_not_before(aiming_log_std):
+    curriculum = CURRICULUM.model_copy(update={"aiming_log_std": aiming_log_std})
+    training = Training(PPO, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
+    noises = {}
+    for epoch in range(6):
+        stage = training.run_epoch(dataset(epoch)).progress.stage
+        noises[stage] = [n.log_std.detach().clone() for n in (training.network, training.average)]
+        if stage == 3:
+            break
+
+    for before, after in zip(noises[2], noises[3], strict=True):
+        assert (before > -2.0).all()
+        if aiming_log_std == -2.5:
+            assert (after == -2.5).all()
+        else:  # smaller noise stays as it is
+            assert (after < -1.0).all()
+            assert (after > -2.0).all()

@@ -1,0 +1,384 @@
+"""The report: groups of runs, their commands, the tables, and a whole page from two tiny runs."""
+
+import json
+import re
+import sys
+from pathlib import Path
+from threading import Event
+
+import numpy as np
+import pytest
+import tomli_w
+
+from common.errors import ReportedError
+from common.evaluation.measures import measures
+from common.policy.actor_critic import NetworkConfig
+from common.policy.contract import contract_of
+from common.policy.folder import load_policy, mean_policy, save_policy
+from common.policy.normalizer import Moments
+from common.policy.weights import new_network
+from common.service.config import ConfigError, HelpRequest, load, to_tables
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
+from common.task.observation import critic_layout, size
+from deploy.config import DeployConfig
+from tests.unit.evaluation.played import MISSED, OUT, RETURNED, make_played
+from topspin import report
+from topspin.report import command
+from topspin.report.collect import Run, RunError, TrainingCurve, read
+from topspin.report.command import settings
+from topspin.report.config import ReportConfig
+from topspin.report.groups import experiment, group
+from topspin.report.provenance import command as command_of
+from topspin.report.provenance import run_defaults
+from topspin.report.results import GroupResult, Results, RunResult, evaluation_task, inequalities, spread
+from topspin.report.tables import PAPER, Table, headline, markdown
+
+OBSERVATION = TaskConfig().observation
+
+
+def make_run(name="r", missing=(), **settings):
+    return Run(name, {"seed": 0} | settings, None, None, None, tuple(missing))
+
+
+def make_result(run, rows, seed=0):
+    played = make_played(rows)
+    return RunResult(run, seed, "", None, None, played, None, measures(played))
+
+
+def write_run(root: Path, name: str, seed: int = 0, **local):
+    """Write a run's folder with settings, three epochs, two evaluations and a fresh policy."""
+    folder = root / "runs" / name
+    network = NetworkConfig(units=(8,))
+    contract = contract_of(
+        TaskConfig(), ExperienceConfig(), network, run=name, generation=1, version=3, stage=2, frames=3000
+    )
+    moments = Moments.initial(size(critic_layout(OBSERVATION)))
+    save_policy(folder / "policy" / "best", new_network(network, OBSERVATION), moments, contract)
+    shared = {"seed": seed, "run": name, "endpoint": f"tcp/127.0.0.1:{7000 + seed}"}
+    sections = {**shared, "local": local}
+    (folder / "config.toml").write_text(tomli_w.dumps(sections))
+    (folder / "metrics.csv").write_text(
+        "epoch,frames,seconds,stage\n1,1000,10,1\n2,2000,20,1\n3,3000,90,2\n4,40"  # its writer was killed
+    )
+    (folder / "report").mkdir()
+    (folder / "report" / "evaluations.csv").write_text(
+        "version,frames,stage,seconds,catch_rate,over_rate,return_rate,target_error_mean\n"
+        "0,0,1,3,0.1,0.05,0.02,\n1,2500,1,9,0.2,0.1,0.05,0.9\n2,2000,1,5,0.5,0.3,0.2,0.6\n3,3000,2,8,0.6,0.4,0.3,0.5\n"
+    )
+    return folder
+
+
+# ---- reading
+
+
+def test_a_resumed_runs_evaluations_count_once_and_at_the_learners_time(tmp_path):
+    curve = read(str(write_run(tmp_path, "a"))).curve
+
+    np.testing.assert_array_equal(curve.frames, [0, 2000, 3000])
+    np.testing.assert_allclose(curve.minutes, [0, 20 / 60, 90 / 60])
+    np.testing.assert_array_equal(curve.values["target_error_mean"], [np.nan, 0.6, 0.5])
+
+
+def test_a_stage_begins_with_the_frames_before_its_first_epoch():
+    training = TrainingCurve(np.array([1.0, 2.0, 3.0, 4.0]), np.zeros(4), np.array([1.0, 1.0, 2.0, 3.0]))
+
+    assert training.stage_changes() == [(2, 2.0), (3, 3.0)]
+
+
+def test_an_unknown_run_is_named_with_the_existing_ones(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path, "night")
+
+    with pytest.raises(RunError, match=r"no run 'nigth'.*runs there: night$"):
+        read("nigth")
+
+
+def test_a_run_without_evaluations_or_policy_is_reported(tmp_path):
+    folder = write_run(tmp_path, "a")
+    (folder / "report" / "evaluations.csv").unlink()
+    (folder / "metrics.csv").unlink()
+
+    run = read(str(folder))
+    assert run.curve is None
+    assert [what.split(":")[0] for what in run.missing] == [
+        "no epochs in metrics.csv",
+        "no evaluations in report/evaluations.csv",
+    ]
+    (folder / "policy" / "best").rename(folder / "policy" / "latest")
+    with pytest.raises(
+        RunError, match=r"run 'a' has nothing to report: .*policy/best isn't there.*--policy latest"
+    ):
+        read(str(folder))
+
+
+# ---- groups
+
+
+def test_runs_that_differ_only_in_seed_name_and_connection_are_one_experiment():
+    runs = [
+        make_run("a", learner={"ppo": {"clip": 0.2}}, run="a", endpoint="tcp/1", minutes=1.0),
+        make_run("b", learner={"ppo": {"clip": 0.1}}),
+        make_run(
+            "c",
+            learner={"ppo": {"clip": 0.2}},
+            run="c",
+            endpoint="tcp/2",
+            local={"metrics_port": 9},
+            minutes=2.0,
+            frames=7,
+            seed=5,
+        ),
+    ]
+
+    assert [[run.name for run in one.runs] for one in group(runs)] == [["a", "c"], ["b"]]
+
+
+def test_evaluation_settings_make_no_experiment():
+    assert experiment({"evaluator": {"rallies": 9}, "actors": 2}) == {"actors": 2}
+
+
+def observing(**options):
+    return {"observation": {"critic": "privileged"} | options}
+
+
+def test_groups_are_named_by_their_differences():
+    usual = {"spin": "estimated", "prediction": True, "age": True}
+    first_3 = {"curriculum": {"first_stage": 3}}
+    groups = group(
+        [
+            make_run("a", task=observing()),
+            make_run("b", task=observing(), learner=first_3),
+            make_run("c", task=observing() | {"collision": "original"}),
+            make_run("d", task=observing(critic="policy", history=8, spin="true")),
+            make_run("e", task=observing(critic="policy", spin="estimated", age=True)),
+            make_run("f", task=observing(prediction=True)),
+            make_run("g", task=observing(**usual)),
+            make_run("h", task=observing(ball="filtered")),
+            make_run("i", task=observing(ball="filtered", **usual)),
+            make_run("j", task=observing(), experience={"teacher": {"policy": "assets/policies/default"}}),
+            make_run(
+                "k", task=observing(), experience={"teacher": {"policy": "default", "arm_memory": True}}
+            ),
+        ]
+    )
+
+    assert [one.label for one in groups] == [
+        "stages 1+2+3, 37 numbers",
+        "stage 3 only, 37 numbers",
+        "stages 1+2+3, original collisions, 37 numbers",
+        "stages 1+2+3, history 8 + true spin, critic observes no more",
+        "stages 1+2+3, estimated spin + sample age, critic observes no more",
+        "stages 1+2+3, prediction",
+        "stages 1+2+3",
+        "stages 1+2+3, 37 numbers, ball filtered",
+        "stages 1+2+3, ball filtered",
+        "stages 1+2+3, distilled from default, 37 numbers",
+        "stages 1+2+3, distilled from default with arm memory, 37 numbers",
+    ]
+    assert groups[0].description == (
+        "stages 1+2+3, tailored collisions, observes 37 numbers, critic observes the truth"
+    )
+
+
+def test_experiments_of_one_name_are_distinguished_by_the_settings_that_differ():
+    runs = [
+        make_run(name, learner={"ppo": {"clip": clip, "gamma": 0.99}})
+        for name, clip in (("a", 0.2), ("b", 0.1))
+    ]
+
+    assert [one.label for one in group(runs)] == ["stages 1+2+3, clip 0.2", "stages 1+2+3, clip 0.1"]
+
+
+# ---- commands
+
+
+def test_a_command_is_the_settings_that_are_not_the_defaults():
+    defaults = {
+        "actors": 2,
+        "seed": 0,
+        "task.randomization": "standard",
+        "learner.ppo.clip": 0.2,
+        "network.units": (8, 4),
+        "evaluate": True,
+    }
+    settings = {
+        "run": "a b",
+        "actors": 4,
+        "seed": 0,
+        "endpoint": "tcp/1",
+        "local": {"panel": "off", "evaluate": False},
+        "task": {"randomization": "standard"},
+        "learner": {"ppo": {"clip": 0.1}},
+        "network": {"units": [8, 4]},
+    }
+
+    assert command_of("a b", settings, defaults) == (
+        "topspin train --run 'a b' --actors 4 --evaluate false --learner.ppo.clip 0.1"
+    )
+
+
+def test_a_command_gives_the_settings_it_was_made_from():
+    argv = "--run n --actors 3 --task.observation.history 8 --network.units 64,32 --learner.curriculum.first-stage 3"
+    config = load(DeployConfig, argv.split(), prog="p", section="local", environ={})
+
+    found = command_of("n", to_tables(config, "local"), run_defaults())
+
+    again = load(DeployConfig, found.split()[2:], prog="p", section="local", environ={})
+    assert again == config
+    assert sorted(found.split()[2:]) == sorted(argv.split())
+
+
+# ---- tables
+
+
+def test_a_table_is_markdown():
+    table = Table("t", ("bin", "rate"), (("a|b", "1 %"), ("ours", "2 %")), frozenset({1}))
+
+    assert markdown(table) == "| bin | rate |\n|---|---:|\n| a\\|b | 1 % |\n| **ours** | 2 % |\n"
+
+
+def test_the_headline_has_the_papers_rows_and_ours_with_spread_and_interval():
+    run = make_run()
+    results = [
+        make_result(run, [RETURNED] * 8 + [OUT, MISSED]),
+        make_result(run, [RETURNED] * 6 + [OUT] * 4, seed=1),
+    ]
+    rows = [RETURNED] * 14 + [OUT] * 5 + [MISSED]
+    names = ("catch_rate", "return_rate", "return_after_catch", "target_error_mean")
+    one = GroupResult(
+        "stages 1+2+3", "", tuple(results), make_played(rows), measures(make_played(rows)),
+        {name: spread(results, name) for name in names}, {}, {},
+    )  # fmt: skip
+    table = headline(Results((one,), ReportConfig(), {}, {}, ()))
+
+    assert table.rows[: len(PAPER)] == PAPER
+    # returned: 0.8 and 0.6, sample deviation 0.1414; 14 of 20; after catch 8/9 and 6/10; 14 of 19
+    assert table.rows[len(PAPER) :] == (
+        (
+            "Topspin, stages 1+2+3 (2 seeds)",
+            "yes",
+            "70.0 ± 14.1 % [48.1, 85.5]",
+            "74.4 ± 20.4 % [51.2, 88.2]",
+            "0.200 ± 0.000 m [0.200, 0.200]",
+        ),
+    )
+
+
+def test_the_papers_rows_name_the_right_works():
+    rows = {row[0]: row[3:] for row in PAPER}
+
+    assert rows["Hu et al. 2025, stages 1+2+3"] == ("90 %", "0.31 m")
+    assert rows["Focused player (Koç et al. 2018)"] == ("–", "0.25 m")
+    assert rows["8dof + GCBC + SSP (GoalsEye, Ding et al. 2022)"] == ("–", "0.84 m")
+
+
+# ---- the command line
+
+
+def test_words_that_are_neither_flags_nor_their_values_are_runs():
+    config = settings(["a", "--rallies", "5", "b", "--rounds-too", "c", "--out", "o"])
+
+    assert (config.runs, config.rallies, config.rounds_too, config.out) == (("a", "b", "c"), 5, True, "o")
+
+
+def test_no_run_and_unknown_flags_are_errors_and_help_is_real():
+    with pytest.raises(ConfigError, match="no run to report on"):
+        settings([])
+    with pytest.raises(ConfigError, match="unknown flag --ralies; did you mean '--rallies'"):
+        settings(["a", "--ralies", "5"])
+    with pytest.raises(HelpRequest, match=r"report RUN\.\.\.(.|\n)*--rallies +rallies to play"):
+        settings(["--help"])
+
+
+def test_without_its_libraries_a_report_names_the_extra(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "topspin.report.figures", None)
+    monkeypatch.delattr(report, "figures", raising=False)  # where an earlier test has imported it
+
+    with pytest.raises(ReportedError, match=r"pip install -e '\.\[report\]'"):
+        command.main([str(write_run(tmp_path, "a"))], Event())
+
+
+def test_policies_are_measured_on_the_reports_task_not_their_training_task(tmp_path):
+    policy = read(str(write_run(tmp_path, "a"))).policy
+
+    task = evaluation_task(policy, ReportConfig(), 1)
+    assert (task.randomization, task.collision, task.rounds) == ("standard", "tailored", 1)
+    assert (task.control_rate_hz, task.flight) == (50, "simple")
+    assert task.observation == policy.contract.task.observation
+
+
+def test_runs_of_unequal_length_or_of_one_seed_are_reported():
+    def of(*frames_and_seeds):
+        runs = tuple(
+            RunResult(make_run(), seed, "", frames, None, None, None, {}) for frames, seed in frames_and_seeds
+        )
+        return GroupResult("ours", "", runs, None, {}, {}, {}, {})
+
+    assert not [*inequalities([of((10_000_000, 0), (10_002_432, 1), (None, 2))])]
+    assert [*inequalities([of((10_000_000, 0), (60_000_000, 1)), of((5, 3), (5, 3))])] == [
+        "ours: its runs are of different length, 10.0 to 60.0 M frames",
+        "ours: several runs of seed 3",
+    ]
+
+
+def test_a_mean_of_policies_is_reported_as_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    best = write_run(tmp_path, "a") / "policy" / "best"
+    policy = load_policy(best)
+    mean = mean_policy([policy, policy])
+    save_policy(best, mean.network, mean.moments, mean.contract)
+
+    command.main(["a", "--rallies", "24", "--envs", "24", "--out", "o"], Event())
+
+    page = (tmp_path / "o" / "report.md").read_text()
+    assert "| **Topspin, stages 1+2+3 (1 seed, mean of 2 policies)** |" in page
+    assert "mean of 2, to 0.0 M, stage 2" in page
+    assert "its policy is the mean of 2\n#     a 3000 frames, launch paper\n#     a 3000 frames" in page
+    found = json.loads((tmp_path / "o" / "results.json").read_text())
+    assert found["groups"][0]["runs"][0]["policy"]["mean_of"] == ["a 3000 frames, launch paper"] * 2
+
+
+def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path, "a", seed=0)
+    (write_run(tmp_path, "b", seed=1) / "metrics.csv").unlink()
+
+    (tmp_path / "note.txt").write_text("It plays\nwell | mostly.\n\n\nSecond <thing>.\n")
+
+    words = ["a", "b", "a", "--rallies", "24", "--envs", "24", "--rounds-too", "--out", "o"]
+    command.main([*words, "--note", "note.txt"], Event())
+
+    assert capsys.readouterr().out.split() == ["o/report.md", "o/report.html", "o/results.json"]
+    found = json.loads((tmp_path / "o" / "results.json").read_text())
+    (one,) = found["groups"]
+    assert one["seeds"] == [0, 1]
+    assert [run["measures"]["rallies"] for run in one["runs"]] == [24, 24]
+    assert one["pooled"]["rallies"] == 48
+    assert one["over_seeds"]["catch_rate"]["seeds"] == 2
+    assert one["runs"][0]["stage_changes"] == [[2, 2000.0]]
+    assert found["missing"] == ["b: no epochs in metrics.csv: frames, hours and stages are unknown"]
+    page = (tmp_path / "o" / "report.md").read_text()
+    assert "| **Topspin, stages 1+2+3 (2 seeds)** | yes |" in page
+    assert "- b: no epochs in metrics.csv" in page
+    assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
+    assert "--rounds-too --note note.txt" in page
+    assert "topspin train --run b --seed 1" in page
+    drawn = re.findall(r"!\[.*?\]\((.*?)\)", page)
+    assert {"curves_frames.png", "landings.png", "courts.png", "rates.png", "rounds.png"} <= set(drawn)
+    assert all((tmp_path / "o" / name).stat().st_size > 5000 for name in drawn)
+    html = (tmp_path / "o" / "report.html").read_text()
+    assert html.count("<img ") == len(drawn)
+    assert "<p>Second &lt;thing&gt;.</p>" in html
+    assert set(re.findall(r'(?:src|href)="(.{22})', html)) == {"data:image/png;base64,"}
+    assert str(tmp_path) not in page + html + json.dumps(found)
+
+
+def test_an_unreadable_note_is_an_error_before_anything_is_played(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_run(tmp_path, "a")
+
+    with pytest.raises(ReportedError, match=r"can't read the note no\.txt: No such file"):
+        command.main(["a", "--note", "no.txt"], Event())
+    assert not (tmp_path / "runs" / "report").exists()

@@ -1,0 +1,70 @@
+"""The `topspin` command: its subcommands, their help, and its mistakes."""
+
+from threading import Event
+
+import pytest
+
+from common.service.config import ConfigError, HelpRequest
+from topspin.__main__ import COMMANDS, dispatch
+
+NEVER = Event()
+
+
+def help_of(*argv):
+    with pytest.raises(HelpRequest) as caught:
+        dispatch(argv, NEVER)
+    return str(caught.value)
+
+
+def test_help_lists_every_command_within_80_columns():
+    text = help_of("--help")
+
+    assert all(f"  {name}" in text for name in COMMANDS)
+    assert max(map(len, text.splitlines())) <= 80
+    assert help_of() == text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_short_and_a_long_help(name):
+    short, whole = help_of(name, "--help"), help_of(name, "--help-all")
+
+    assert short.startswith(f"usage: topspin {name}")
+    assert sum(line.startswith("  --") for line in short.splitlines()) <= 12
+    assert len(whole) > len(short) or "--help-all" not in short
+    assert max(map(len, whole.splitlines())) <= 80
+
+
+def test_the_version_is_the_packages():
+    assert help_of("--version").startswith("topspin 0.")
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [("pley", "unknown command 'pley'; did you mean 'play'?"), ("x", "allowed: train, play, evaluate")],
+)
+def test_an_unknown_command_is_one_line(word, line):
+    with pytest.raises(ConfigError, match=line):
+        dispatch([word], NEVER)
+
+
+def test_importing_topspin_registers_the_environments_and_offers_policies():
+    import gymnasium
+
+    import topspin
+
+    assert "topspin/Rally-v0" in gymnasium.registry
+    policy = topspin.load_policy("paper")
+    observer = topspin.Observer(policy.contract.task.observation)
+    observer.begin((0.9, -0.3))
+    ball = topspin.BallSample((0.5, 0.0, 0.3), (-5.0, 0.0, 0.0), 0, 0.0)
+    obs = observer.observe(0.02, [0.0] * 7, [0.0] * 7, ball)
+    assert policy.act(obs[None]).shape == (1, 7)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        topspin.nothing  # noqa: B018
+
+
+def test_gymnasium_finds_the_environments_without_an_import():
+    from importlib.metadata import entry_points
+
+    (plugin,) = (point for point in entry_points(group="gymnasium.envs") if point.dist.name == "topspin")
+    assert plugin.load().__name__ == "register_envs"

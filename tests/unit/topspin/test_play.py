@@ -1,0 +1,96 @@
+import json
+from threading import Event
+
+import pytest
+
+from common.evaluation.evaluate import StoppedError
+from common.policy.folder import save_policy
+from common.service.config import ConfigError, load
+from tests.unit.evaluation.test_match import make_policy
+from topspin import evaluate, play
+from topspin.pictures import PicturesConfig
+from topspin.play import PlayConfig
+from topspin.render.gl import RenderError
+from topspin.render.scene import Painter
+
+
+@pytest.fixture
+def folder(tmp_path):
+    policy = make_policy()
+    save_policy(tmp_path / "policy", policy.network, policy.moments, policy.contract)
+    return tmp_path / "policy"
+
+
+def test_play_prints_the_measures_as_its_last_line(folder, capsys):
+    arguments = ["--policy", str(folder), "--rallies", "5", "--film-rallies", "0", "--json"]
+
+    assert play.main(arguments, Event()) == 0
+
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (found["rallies"], found["seed"], found["launch"], found["randomization"]) == (
+        5,
+        20260,
+        "paper",
+        "standard",
+    )
+    assert "video" not in found
+
+
+def test_play_films_the_first_rallies(folder, tmp_path, capsys):
+    try:
+        Painter(64, 64).close()
+    except RenderError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+    pytest.importorskip("imageio_ffmpeg", reason="imageio-ffmpeg is missing: pip install -e '.[report]'")
+    video = tmp_path / "play.mp4"
+    arguments = (
+        f"--policy {folder} --rallies 3 --film-rallies 1 --video {video} --width 320 --height 180 "
+        "--rate-hz 10 --json"
+    )
+
+    play.main(arguments.split(), Event())
+
+    assert json.loads(capsys.readouterr().out)["video"] == str(video)
+    assert video.stat().st_size > 10_000
+
+
+def test_play_stops_on_request(folder):
+    stop = Event()
+    stop.set()
+
+    with pytest.raises(StoppedError, match="stopped before it was done"):
+        play.main(["--policy", str(folder), "--film-rallies", "0"], stop)
+
+
+@pytest.mark.parametrize(
+    ("flags", "line"),
+    [
+        (["--video", "play.avi"], r"play.video = 'play.avi' \(--video\); allowed: text, matching"),
+        (["--slow", "0"], r"play.slow = '0' \(--slow\); allowed: a number, from 0.05 to 1"),
+        (["--camera", "top"], "allowed: side, behind, target, follow"),
+        (["--film-ralies", "3"], "unknown flag --film-ralies; did you mean '--film-rallies'"),
+    ],
+)
+def test_a_bad_setting_is_one_line_that_says_what_is_allowed(flags, line):
+    with pytest.raises(ConfigError, match=line):
+        load(PlayConfig, flags, prog="p", section="play", environ={})
+
+
+def test_pictures_are_written_where_the_readme_links_them():
+    assert load(PicturesConfig, [], prog="p", section="pictures", environ={}).out == "docs/pictures"
+
+
+def test_evaluate_measures_under_the_conditions_that_are_given(folder, capsys):
+    flags = "--rallies 4 --launch strong --randomization off --rounds 2 --expected-spin learnt --json"
+
+    assert evaluate.main(["--policy", str(folder), *flags.split()], Event()) == 0
+
+    found = json.loads(capsys.readouterr().out)
+    assert (found["rallies"], found["launch"], found["randomization"]) == (4, "strong", "off")
+    assert (found["rounds"], found["expected_spin"], found["policy"]) == (2, "learnt", str(folder))
+
+
+def test_evaluate_prints_a_table(folder, capsys):
+    evaluate.main(["--policy", str(folder), "--rallies", "4"], Event())
+
+    assert "return_rate" in capsys.readouterr().out

@@ -1,0 +1,31 @@
+"""Topspin: trains a table-tennis robot to return spinning balls.
+
+Importing this package registers ``topspin/Rally-v0`` for Gymnasium. It offers
+
+    topspin.load_policy("default")      a policy of the box, or of a folder
+    topspin.Observer, topspin.BallSample    what a policy observes, from what a robot measures
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from topspin.gym_ids import register_envs
+
+if TYPE_CHECKING:
+    from common.rally.observer import BallSample, Observer
+    from topspin.policy import load_policy
+
+__all__ = ["BallSample", "Observer", "load_policy"]
+
+register_envs()
+
+
+def __getattr__(name: str) -> Any:  # torch takes seconds to import: only when it is needed
+    if name == "load_policy":
+        from topspin.policy import load_policy  # noqa: PLC0415
+
+        return load_policy
+    if name in ("BallSample", "Observer"):
+        from common.rally import observer  # noqa: PLC0415
+
+        return getattr(observer, name)
+    raise AttributeError(f"module 'topspin' has no attribute {name!r}")

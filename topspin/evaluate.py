@@ -1,0 +1,46 @@
+"""`topspin evaluate`: measure a policy on fixed rallies."""
+
+from collections.abc import Sequence
+from threading import Event
+from typing import ClassVar, Final
+
+from pydantic import Field
+
+from common.evaluation.evaluate import check, measure, print_measures
+from common.evaluation.match import MatchConfig
+from common.policy.box import policy_folder
+from common.policy.folder import load_policy
+from common.service.config import load
+from common.service.log import set_up_logging
+from common.service.process import DONE
+from common.service.settings import LogLevel
+
+PROG: Final = "topspin evaluate"
+
+
+class EvaluateConfig(MatchConfig):
+    """Measure a policy on fixed rallies, without exploration noise, every rally to its end.
+
+    Robot, control rate, observation and flight are those of the policy's contract.
+    """
+
+    often: ClassVar = (
+        *("policy", "rallies", "launch", "rounds", "randomization", "perception"),
+        *("collision", "expected_spin", "seed", "json"),
+    )
+
+    policy: str = Field("default", description="a policy of the box, or a policy folder")
+    json_line: bool = Field(
+        False, alias="json", description="print the measures as one JSON object, last line"
+    )
+    log_level: LogLevel = Field("info", description="least severe lines logged")
+
+
+def main(argv: Sequence[str], stop: Event) -> int:
+    """Measure and print; return the exit status."""
+    config = load(EvaluateConfig, argv, prog=PROG, section="evaluate")
+    set_up_logging(config.log_level, "evaluate")
+    folder = policy_folder(config.policy)
+    found = measure(load_policy(folder), folder, config, lambda: check(stop))
+    print_measures(found, config.json_line)
+    return DONE

@@ -1,0 +1,222 @@
+"""The rally environment for Gymnasium, ``topspin/Rally-v0``.
+
+    import gymnasium
+    import topspin
+
+    env = gymnasium.make("topspin/Rally-v0", randomization="off", stage=3)
+    envs = gymnasium.make_vec("topspin/Rally-v0", num_envs=512)
+
+The vector environment is the batch itself (one call steps all robots), not copies of the single one. It starts the next
+episode in the same step; the last observation is ``final_obs``, and the rally's facts are ``final_info``.
+
+Observations are the policy's: the simulator's truth, which only our critic observes, is left out whatever the settings
+say. Every rally is an episode that is played to its end, unless ``end_at_hit_share`` or ``continue_share`` is given.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+from common.env.local_rallies import LocalRallies
+from common.env.rally_env import FinishedRallies, RallyEnv
+from common.task.config import TaskConfig
+from common.task.experience import ExperienceConfig
+from common.task.observation import ACTION, PAPER_OBSERVATION, Part, policy_layout
+
+Floats = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
+
+_EPISODES: Final = ("end_at_hit_share", "continue_share")
+
+
+def _box(layout: tuple[Part, ...]) -> spaces.Box:
+    """Return a layout's space: its parts' ranges."""
+    sizes = [part.size for part in layout]
+    low = np.repeat([part.low for part in layout], sizes).astype(np.float32)
+    high = np.repeat([part.high for part in layout], sizes).astype(np.float32)
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+ACTION_SPACE = _box(ACTION)
+DEFAULTS: Final[Mapping[str, Any]] = {
+    "observation": PAPER_OBSERVATION,
+    "end_at_hit_share": 0.0,
+    "continue_share": 0.0,
+}
+"""Where this environment differs from the one that our actors play."""
+
+
+class _RallyBatch:
+    """A batch of environments with rallies of its own."""
+
+    def __init__(self, count: int, stage: int, settings: dict[str, Any]) -> None:
+        self._count, self._stage = count, stage
+        given = {**DEFAULTS, **settings}
+        episodes = {name: given.pop(name) for name in _EPISODES}
+        self._experience = ExperienceConfig(hit_correction=False, **episodes)
+        task = TaskConfig(**given)
+        observation = task.observation.model_copy(update={"critic": "policy"})
+        self._task = task.model_copy(update={"observation": observation})
+        self.observation_space = _box(policy_layout(observation))
+        self.env: RallyEnv | None = None
+
+    def begin(self, seed: int) -> Floats:
+        """Return the first observations of a sequence of episodes that the seed alone decides."""
+        source = LocalRallies(seed, self._task)
+        self.env = RallyEnv(self._count, self._task, source, self._stage, experience=self._experience)
+        return self.env.reset()
+
+    @property
+    def started(self) -> RallyEnv:
+        """The environments; raises before the first reset."""
+        if self.env is None:
+            raise gymnasium.error.ResetNeeded("step() before reset(): call reset() first")
+        return self.env
+
+
+def _within(obs: Floats, space: spaces.Box) -> Floats:
+    """Return observations clipped to their stated ranges: a blow can throw a ball beyond them."""
+    clipped: Floats = np.clip(obs, space.low, space.high)
+    return clipped
+
+
+def _fresh_seed(random: np.random.Generator) -> int:
+    return int(random.integers(2**63))
+
+
+def _facts(finished: FinishedRallies) -> dict[str, npt.NDArray[Any]]:
+    """Return what Gymnasium's users may want to know of rallies that ended."""
+    return {
+        "outcome": finished.outcomes.astype(np.int64),
+        "caught": finished.caught,
+        "over": finished.over,
+        "landing_error": finished.landing_errors,
+    }
+
+
+class RallyGymEnv(gymnasium.Env[Any, Any]):
+    """One robot, one ball.
+
+    Args:
+        stage: Curriculum stage 1..3, the reward's column.
+        render_mode: None: films are made from recorded rallies.
+        settings: Fields of ``TaskConfig`` and ``ExperienceConfig``, over ``DEFAULTS``: ``launch="strong"``,
+            ``randomization="off"``, ``control_rate_hz=200`` ...
+    """
+
+    metadata = {"render_modes": [], "render_fps": 50}  # noqa: RUF012  # Gymnasium's own name and form
+
+    def __init__(self, stage: int = 3, render_mode: str | None = None, **settings: Any) -> None:
+        self.render_mode = render_mode
+        self._batch = _RallyBatch(1, stage, settings)
+        self.observation_space, self.action_space = self._batch.observation_space, ACTION_SPACE
+        self._next_obs: Floats | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin an episode: anew with a seed, or else the one that follows on the last, against the same other side."""
+        super().reset(seed=seed)
+        if seed is not None or self._batch.env is None:
+            obs = self._batch.begin(_fresh_seed(self.np_random))
+        elif self._next_obs is None:  # in the middle of an episode
+            obs = self._batch.env.reset()
+        else:
+            obs = self._next_obs
+        self._next_obs = None
+        return _within(obs[0], self._batch.observation_space), {}
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Play one control step."""
+        if self._next_obs is not None:
+            raise gymnasium.error.ResetNeeded("step() after the episode's end: call reset() first")
+        step = self._batch.started.step(np.asarray(action)[None])
+        obs = step.obs
+        if step.ended.size:
+            self._next_obs, obs = step.obs, step.final_obs
+        info = {name: values[0] for name, values in _facts(step.finished).items() if values.size}
+        return (
+            _within(obs[0], self._batch.observation_space),
+            float(step.reward[0]),
+            bool(step.terminated[0]),
+            bool(step.truncated[0]),
+            info,
+        )
+
+
+class RallyVectorEnv(VectorEnv[Any, Any, Any]):
+    """A batch of robots in one simulation call.
+
+    Args:
+        num_envs: How many.
+        stage: Curriculum stage 1..3, the reward's column.
+        render_mode: None: films are made from recorded rallies.
+        settings: As for ``RallyGymEnv``.
+    """
+
+    metadata = {  # noqa: RUF012  # Gymnasium's own name and form
+        "render_modes": [],
+        "render_fps": 50,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        stage: int = 3,
+        render_mode: str | None = None,
+        **settings: Any,
+    ) -> None:
+        self.num_envs = num_envs
+        self._batch = _RallyBatch(num_envs, stage, settings)
+        self.single_observation_space, self.single_action_space = self._batch.observation_space, ACTION_SPACE
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
+        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
+        self.render_mode = render_mode
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
+        """Begin all episodes anew; one seed decides them all."""
+        super().reset(seed=seed)
+        if seed is not None or self._batch.env is None:
+            return _within(self._batch.begin(_fresh_seed(self.np_random)), self._batch.observation_space), {}
+        return _within(self._batch.env.reset(), self._batch.observation_space), {}
+
+    def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
+        """Play one control step with every robot."""
+        step = self._batch.started.step(actions)
+        infos: dict[str, Any] = {}
+        if step.ended.size:
+            ended = np.zeros(self.num_envs, np.bool_)
+            ended[step.ended] = True
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for row, obs in zip(
+                step.ended, _within(step.final_obs, self._batch.observation_space), strict=True
+            ):
+                final_obs[row] = obs
+            infos = {"final_obs": final_obs, "_final_obs": ended, "_final_info": ended.copy()}
+            infos["final_info"] = self._final_info(step.finished, ended)
+        rewards = step.reward.astype(np.float64)
+        return (
+            _within(step.obs, self._batch.observation_space),
+            rewards,
+            step.terminated,
+            step.truncated,
+            infos,
+        )
+
+    def _final_info(self, finished: FinishedRallies, ended: Flags) -> dict[str, npt.NDArray[Any]]:
+        """Return each fact as (B,), with its mask: Gymnasium's form of a batch of dicts."""
+        info = {}
+        last = ended[finished.rows]  # others go on over a return
+        for name, values in _facts(finished).items():
+            column = np.zeros(self.num_envs, values.dtype)
+            column[finished.rows[last]] = values[last]
+            info[name], info[f"_{name}"] = column, ended.copy()
+        return info

@@ -1,0 +1,69 @@
+"""`topspin play`: measure a policy on fixed rallies, and film the first of them."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Event
+from typing import ClassVar, Final
+
+from pydantic import Field
+
+from common.evaluation.evaluate import check, measure, print_measures
+from common.evaluation.match import MatchConfig, evaluation_rallies, match_task
+from common.evaluation.rally_recorder import record_rallies
+from common.policy.box import policy_folder
+from common.policy.folder import load_policy
+from common.service.config import load
+from common.service.log import set_up_logging
+from common.service.process import DONE
+from common.service.settings import LogLevel
+from topspin.render.film import check_tools
+from topspin.render.options import FilmConfig, film
+
+PROG: Final = "topspin play"
+
+
+class PlayConfig(MatchConfig, FilmConfig):
+    """Measure a policy on fixed rallies, and film the first of them.
+
+    Robot, control rate, observation and flight are those of the policy's contract.
+    """
+
+    often: ClassVar = (
+        *("policy", "video", "rallies", "film_rallies", "launch", "rounds"),
+        *("randomization", "camera", "slow", "json"),
+    )
+
+    policy: str = Field("default", description="a policy of the box, or a policy folder")
+    video: str = Field("runs/play.mp4", pattern=r"\.mp4$", description="film to write, H.264")
+    film_rallies: int = Field(8, ge=0, le=200, description="rallies to film, the first ones; 0: no film")
+    json_line: bool = Field(
+        False, alias="json", description="print the measures as one JSON object, last line"
+    )
+    log_level: LogLevel = Field("info", description="least severe lines logged")
+
+
+def main(argv: Sequence[str], stop: Event) -> int:
+    """Measure and film; return the exit status."""
+    config = load(PlayConfig, argv, prog=PROG, section="play")
+    set_up_logging(config.log_level, "play")
+    started = time.monotonic()
+    folder = policy_folder(config.policy)
+    policy = load_policy(folder)
+    if config.film_rallies:
+        check_tools()
+
+    def on_tick() -> None:
+        check(stop)
+
+    found = measure(policy, folder, config, on_tick)
+    if config.film_rallies:
+        found["video"] = config.video
+        task = match_task(policy.contract, config, config.expected_spin)
+        rallies = evaluation_rallies(config.film_rallies, task, config.seed)
+        note = f"{config.launch} balls, randomization {config.randomization}"
+        # played once more, from home: a match keeps no flights
+        film(Path(config.video), record_rallies(policy.act, rallies, task), config, note, on_tick)
+    found["seconds"] = round(time.monotonic() - started, 2)
+    print_measures(found, config.json_line)
+    return DONE

@@ -1,0 +1,1 @@
+"""Fitting recorded tracks: bounces, launch, spin, drag and lift."""

@@ -1,0 +1,92 @@
+"""Provenance: the commands of the runs, and the versions and machine of the report."""
+
+import os
+import platform
+import shlex
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from common.service.config import flag_of
+from common.service.config_help import settings_of
+from deploy.config import DeployConfig
+from topspin.report.groups import leaves
+
+PROGRAM: Final = "topspin train"
+PACKAGES: Final = ("topspin", "numpy", "torch", "mujoco", "numba", "eclipse-zenoh")
+NOT_IN_COMMAND: Final = frozenset(
+    {"run", "resume", "panel", "endpoint", "metrics_port"}
+)  # they do not change a run's result
+
+
+def run_defaults() -> dict[str, Any]:
+    """Return the defaults of a run by dotted path."""
+    return {path: setting.default for path, setting in settings_of(DeployConfig).items()}
+
+
+def command(name: str, settings: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
+    """Return the command that starts such a run: its settings that aren't the defaults, as flags.
+
+    Args:
+        name: The run's name.
+        settings: The run's config.toml.
+        defaults: A run's defaults by dotted path. A setting without one (of another version) is a flag too.
+    """
+    if "local" not in settings:  # its services were started one by one
+        return f"python -m services.learner --config runs/{name}/config.toml"
+    words = [PROGRAM, "--run", name]
+    for full, value in leaves(settings):
+        path = full.removeprefix("local.")
+        default = defaults.get(path)
+        if path not in NOT_IN_COMMAND and value != (list(default) if isinstance(default, tuple) else default):
+            words += [f"--{flag_of(path)}", _text(value)]
+    return " ".join(words[:1] + [shlex.quote(word) for word in words[1:]])
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return ",".join(str(item) for item in value)
+    return str(value)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that decide the numbers, and the commit if there is one."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    commit = commit_of(Path(__file__).parent)
+    return found | ({"commit": commit} if commit else {})
+
+
+def machine() -> dict[str, str]:
+    """Return processor and cores of this machine."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return {"processor": _processor(Path("/proc/cpuinfo")), "cores": str(cores), "system": platform.system()}
+
+
+def _processor(cpuinfo: Path) -> str:
+    if cpuinfo.is_file():
+        for line in cpuinfo.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def commit_of(folder: Path) -> str:
+    """Return the commit of the sources, with + where they differ from it; empty outside a repository."""
+    try:
+        described = subprocess.run(
+            ["git", "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+"],
+            cwd=folder, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return described.stdout.strip()
