@@ -120,7 +120,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin an episode: anew with a seed, or else the one that follows on the last, against the same other side."""
+        """Begin an episode: with a seed, everything starts again; without one, the opponent stays the same."""
         super().reset(seed=seed)
         if seed is not None or self._batch.env is None:
             obs = self._batch.begin(_fresh_seed(self.np_random))
@@ -182,7 +182,7 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin all episodes anew; one seed decides them all."""
+        """Begin all episodes. One seed decides them all."""
         super().reset(seed=seed)
         if seed is not None or self._batch.env is None:
             return _within(self._batch.begin(_fresh_seed(self.np_random)), self._batch.observation_space), {}

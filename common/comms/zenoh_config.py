@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class LinkConfig(BaseModel):
-    """Where the hub is and how to get there: the same for all services of a run."""
+    """Address of the hub and the keys for it: the same for all services of a run."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

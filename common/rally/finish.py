@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from common.jit import kernel
+from common.jit import inlined, kernel
 from common.physics.arm import joints_at, racket_pose
 from common.physics.constants import BALL_RADIUS, GRID_STEP
 from common.physics.fly import RobotPath, fly_step
@@ -94,7 +94,7 @@ def simulate_to_landing(
     return FlightResult(pos, vel, spin, state, outcome, False, False, landed, 0.0), aim
 
 
-@kernel
+@inlined
 def _landing_bonus(rallies: Rallies, b: int, result: FlightResult, rules: Rules) -> float:
     """Return the bonus for the predicted landing point of a ball that was just hit, once a rally (ADR-0016)."""
     is_due = rules.landing_bonus > 0.0 and result.state == _TAU_23 and result.outcome == 0
@@ -111,7 +111,7 @@ def _landing_bonus(rallies: Rallies, b: int, result: FlightResult, rules: Rules)
     return bonus
 
 
-@kernel
+@inlined
 def pay(
     rallies: Rallies,
     b: int,
@@ -182,7 +182,7 @@ def pay(
     step.reward[b] = total
 
 
-@kernel
+@inlined
 def end_rally(rallies: Rallies, b: int, result: FlightResult, rules: Rules) -> tuple[int, int]:
     """Return state and outcome after the control step. An instant lasts one step. The time limit may end the rally."""
     state, outcome = result.state, result.outcome
@@ -194,7 +194,7 @@ def end_rally(rallies: Rallies, b: int, result: FlightResult, rules: Rules) -> t
     return state, outcome
 
 
-@kernel
+@inlined
 def write_back(rallies: Rallies, b: int, result: FlightResult, state: int, outcome: int, step: Step) -> None:
     """Write ball b's state and outcome into its row."""
     ball = rallies.ball[b]
@@ -204,7 +204,7 @@ def write_back(rallies: Rallies, b: int, result: FlightResult, state: int, outco
         ball[k], ball[3 + k], ball[6 + k] = result.pos[k], result.vel[k], result.spin[k]
 
 
-@kernel
+@inlined
 def finish_step(
     rallies: Rallies,
     b: int,

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from common.jit import kernel
+from common.jit import inlined, kernel
 from common.perception.camera import DETECTION_BUFFER, READ, TAKEN, detect_along_flight, detection_row
 from common.perception.camera_filter import add_detection, begin_filter, estimate_at, is_guess
 from common.perception.flight_filter import add_measurement, begin_track, predict_interception
@@ -22,7 +22,7 @@ Array = npt.NDArray[np.float64]
 _CAMERA: Final = int(Stream.CAMERA)
 
 
-@kernel
+@inlined
 def sample_measurement(rallies: Rallies, b: int, step: int, profile: RandomizationProfile) -> None:
     """Measure ball b's true state one latency ago, with noise. If the sample is lost, the last measurement stays."""
     seed = rallies.seed[b]
@@ -82,7 +82,7 @@ def filter_measurement(rallies: Rallies, b: int, profile: RandomizationProfile) 
     measurement[6] = state
 
 
-@kernel
+@inlined
 def update_flight_filter(
     track: Array,
     measurement: Array,
@@ -117,7 +117,7 @@ def update_flight_filter(
             track[PRESENT + k] = measurement[k]
 
 
-@kernel
+@inlined
 def update_perception(rallies: Rallies, b: int, step: int, profile: RandomizationProfile) -> None:
     """Measure ball b, and update the measurement history and the flight filter.
 
@@ -174,7 +174,7 @@ def record_detections(
     )
 
 
-@kernel
+@inlined
 def advance_clock(rallies: Rallies, b: int, pos: Vec, vel: Vec, state: int) -> None:
     """Advance ball b's clock by one grid step and put its true state into the ring."""
     rallies.clock[b] += 1

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from common.jit import kernel
+from common.jit import inlined, kernel
 from common.perception.camera import DETECTION_BUFFER, begin_detections
 from common.physics.arm import (
     joint_rates_at,
@@ -172,7 +172,7 @@ def _hit_ball(
     return vel, spin, min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED), True
 
 
-@kernel
+@inlined
 def _fly_one(
     rallies: Rallies, b: int, robot: RobotPath, rules: Rules, profile: RandomizationProfile, step: Step
 ) -> FlightResult:

@@ -9,11 +9,13 @@ from common.jit import KERNEL_ROOMS
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("common", "services", "deploy", "topspin")
-KERNEL = re.compile(r"^@kernel\b|\bkernel\(|^from common\.jit import .*\bkernel\b", re.MULTILINE)
+KERNEL = re.compile(
+    r"^@(kernel|inlined)\b|\bkernel\(|^from common\.jit import .*\b(kernel|inlined)\b", re.MULTILINE
+)
 
 
 def files_with_kernels() -> list[str]:
-    """Return the files of the packages that use ``kernel``, without ``common/jit.py``, which defines it."""
+    """Return the files of the packages that compile kernels, without ``common/jit.py`` itself."""
     files = (path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py")))
     return [
         path.relative_to(ROOT).as_posix()
