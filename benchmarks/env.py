@@ -21,7 +21,7 @@ from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
 from common.env.rally_env import Launches, RallyEnv
-from common.env.robot import load_model
+from common.robot.model import load_model
 from common.task.config import Randomization, TaskConfig
 from common.task.launch import RallyBlock, draw_rallies
 

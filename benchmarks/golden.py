@@ -1,9 +1,10 @@
-"""Golden outcomes: whether the policies of the box play fixed rallies as they did before the code moved.
+"""Golden outcomes: whether the policies of the box play fixed rallies as they did when the outcomes were recorded.
 
     python -m benchmarks.golden --json
+    python -m benchmarks.golden --write true    after a change of the task or the box, to record them again
 
-The file ``results/golden_outcomes.npz`` was made before the code moved to its present folders and names. It holds the
-results of 8,800 rallies in eleven cases. This benchmark plays them again and counts the rallies with any difference.
+The file ``results/golden_outcomes.npz`` holds the results of 8,800 rallies in eleven cases. This benchmark plays them
+again and counts the rallies with any difference. A change that claims to leave behaviour alone must have none.
 Bits are only comparable on the same processor and with the same library versions: elsewhere a difference is no error.
 """
 
@@ -13,11 +14,11 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Event
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from benchmarks.settings import BenchmarkConfig, run
 from common.evaluation.evaluate import check
@@ -94,17 +95,37 @@ def differences(name: str, result: MatchResult, golden: Golden) -> int:
 
 
 class GoldenConfig(BenchmarkConfig):
-    """Play rallies whose results were recorded before the code moved, and count the rallies that differ.
+    """Play rallies whose results were recorded, and count the rallies that differ.
 
     Bits are only comparable on the same processor and with the same library versions. The exit status is 1 if any
     rally differs.
     """
 
     cases: tuple[str, ...] = Field((), description=f"cases to play; empty: all of {', '.join(CASES)}")
+    write: bool = Field(False, description="record the outcomes of all cases instead of comparing them")
+
+    @model_validator(mode="after")
+    def _all_are_written(self) -> Self:
+        if self.write and self.cases:
+            raise ValueError(f"write with cases {', '.join(self.cases)}; allowed: write alone, for all cases")
+        return self
+
+
+def write(stop: Event) -> int:
+    """Record the outcomes of all cases."""
+    played = {name: play(case, case.rallies, lambda: check(stop)) for name, case in CASES.items()}
+    arrays = {
+        f"{name}/{field}": getattr(result, field) for name, result in played.items() for field in FIELDS
+    }
+    np.savez_compressed(FILE, allow_pickle=False, **arrays)
+    print(f"{sum(case.rallies for case in CASES.values())} rallies recorded in {FILE.name}")
+    return 0
 
 
 def main(config: GoldenConfig, stop: Event) -> int:
     """Play, compare and print."""
+    if config.write:
+        return write(stop)
     started, golden = time.monotonic(), load_golden()
     if unknown := set(config.cases) - CASES.keys():
         raise ConfigError(f"unknown cases {sorted(unknown)}; allowed: {', '.join(CASES)}")

@@ -1,7 +1,7 @@
 """Settings that all benchmarks have, and how a benchmark is started."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Event
 from typing import Final, TypeVar
 
@@ -24,13 +24,20 @@ class BenchmarkConfig(BaseModel):
 _Config = TypeVar("_Config", bound=BenchmarkConfig)
 
 
-def run(name: str, model: type[_Config], main: Callable[[_Config, Event], int]) -> int:
+def run(
+    name: str,
+    model: type[_Config],
+    main: Callable[[_Config, Event], int],
+    argv: Sequence[str] | None = None,
+) -> int:
     """Return the exit status of a benchmark that is started from the command line.
 
     Args:
         name: Of its file.
         model: Its settings; the docstring says what it measures.
         main: Measures and prints. It gets the settings, and the event that Ctrl-C sets.
+        argv: Flags; those of the command line by default.
     """
     prog = f"python -m benchmarks.{name}"
-    return run_service(prog, lambda stop: main(load(model, sys.argv[1:], prog=prog, section=SECTION), stop))
+    flags = sys.argv[1:] if argv is None else argv
+    return run_service(prog, lambda stop: main(load(model, flags, prog=prog, section=SECTION), stop))

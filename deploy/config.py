@@ -1,10 +1,12 @@
 """Settings of a whole run on one machine: the number of processes, and the settings of each."""
 
-from typing import ClassVar, Final, Literal
+from pathlib import Path
+from typing import ClassVar, Final, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from common.policy.actor_critic import NetworkConfig
+from common.service.config import recipe_names
 from common.service.settings import Fleet, RunSettings
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
@@ -14,6 +16,7 @@ from services.generator.config import GeneratorOptions
 from services.learner.budget import BudgetConfig
 from services.learner.config import LearnerOptions
 
+RECIPES: Final = Path(__file__).with_name("recipes")
 CONNECT_S: Final = 60.0  # limit for the learner to start listening
 
 
@@ -25,11 +28,16 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     """
 
     often: ClassVar = (
-        *("run", "resume", "actors", "minutes", "frames", "seed"),
-        *("task.launch", "task.randomization", "learner.curriculum.first_stage", "metrics_port"),
+        *("run", "recipe", "resume", "actors", "minutes", "frames", "seed"),
+        *("task.launch", "task.randomization", "learner.curriculum.first_stage"),
     )
 
     run: str = Field("", description="name of the run; empty: a time stamp. runs/latest points to it")
+    recipe: str = Field(
+        "",
+        description="settings that a run starts from, in place of the defaults: "
+        f"{', '.join(recipe_names(RECIPES))}, or a TOML file; empty: none",
+    )
     endpoint: str = Field(
         "",
         pattern=r"^$|^(tcp|tls|unixsock-stream)/.+",
@@ -54,3 +62,8 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     actor: ActorOptions = ActorOptions()
     generator: GeneratorOptions = GeneratorOptions()
     evaluator: EvaluatorOptions = EvaluatorOptions()
+
+    @model_validator(mode="after")
+    def _stages_have_a_budget(self) -> Self:
+        self.learner.curriculum.check_budget(self.frames)
+        return self

@@ -167,7 +167,9 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
     line = run_summary(run, learner)
     if run.config.evaluate and not stop.is_set():
         line |= final_measures(run, stop)
-    sys.stdout.write(json.dumps(line) + "\n")
+    text = json.dumps(line) + "\n"
+    run.folder.final.write_text(text, encoding="utf-8")
+    sys.stdout.write(text)
     if stop.is_set():
         log.warning("stopped before its end; go on with: %s", again)
         return INTERRUPTED

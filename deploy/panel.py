@@ -38,7 +38,8 @@ def share_done(view: View) -> float:
     if learner is None:
         return 0.0
     gauges = learner.gauges
-    shares = [gauges.get("epoch", 0.0) / max(gauges.get("epochs", 0.0), 1.0)]
+    epochs = gauges.get("epochs", 0.0)  # 0: the curriculum's stages are shares of the frames
+    shares = [gauges.get("epoch", 0.0) / epochs if epochs > 0 else 0.0]
     if view.minutes > 0:
         shares.append(gauges.get("seconds", 0.0) / (60.0 * view.minutes))
     if view.frames > 0:

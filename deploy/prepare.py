@@ -15,7 +15,7 @@ from common.comms.zenoh_config import ZenohConfig
 from common.errors import ReportedError
 from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
 from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
-from deploy.config import CONNECT_S, DeployConfig
+from deploy.config import CONNECT_S, RECIPES, DeployConfig
 from deploy.supervisor import Spec
 from services.learner.budget import ENDING_S, Budget
 
@@ -93,7 +93,7 @@ def settings(argv: Sequence[str], prog: str) -> DeployConfig:
     if not asked.resume:
         if asked.run == LATEST:
             raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
-        return load(DeployConfig, argv, prog=prog, section=SECTION)
+        return load(DeployConfig, argv, prog=prog, section=SECTION, recipes=RECIPES)
     if not asked.run:
         newest = f": the newest run is {os.readlink(RUNS / LATEST)}" if (RUNS / LATEST).is_symlink() else ""
         raise ConfigError(f"--resume needs --run NAME{newest}")
@@ -101,12 +101,20 @@ def settings(argv: Sequence[str], prog: str) -> DeployConfig:
     file = RunFolder.of(name).config
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
-    if SECTION not in read_toml(file):
+    own = read_toml(file).get(SECTION)
+    if own is None:
         raise ConfigError(
             f"run {name!r} was started service by service: {file} has no table [{SECTION}]; go on with: "
             f"python -m services.learner --run {name} --resume"
         )
+    # The file has every setting, those of its recipe too
     resumed = load(DeployConfig, argv, prog=prog, section=SECTION, recorded=file)
+    recipe = own.get("recipe", "")
+    if resumed.recipe not in ("", recipe):
+        raise ConfigError(
+            f"--recipe {resumed.recipe} with --resume: run {name!r} started with "
+            f"{f'recipe {recipe}' if recipe else 'no recipe'}; allowed: no --recipe"
+        )
     return resumed.model_copy(update={"run": name})
 
 

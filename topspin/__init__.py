@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from topspin.gym_ids import register_envs
 
 if TYPE_CHECKING:
-    from common.rally.observer import BallSample, Observer
+    from common.rally.observer import BallSample
+    from topspin.observer import Observer
     from topspin.policy import load_policy
 
 __all__ = ["BallSample", "Observer", "load_policy"]
@@ -24,8 +25,12 @@ def __getattr__(name: str) -> Any:  # torch takes seconds to import: only when i
         from topspin.policy import load_policy  # noqa: PLC0415
 
         return load_policy
-    if name in ("BallSample", "Observer"):
-        from common.rally import observer  # noqa: PLC0415
+    if name == "BallSample":
+        from common.rally.observer import BallSample  # noqa: PLC0415
 
-        return getattr(observer, name)
+        return BallSample
+    if name == "Observer":
+        from topspin.observer import Observer  # noqa: PLC0415
+
+        return Observer
     raise AttributeError(f"module 'topspin' has no attribute {name!r}")

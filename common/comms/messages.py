@@ -62,7 +62,8 @@ class RallyRequest:
 
 
 AVERAGE = b"average"
-"""Payload of a policy request for the running mean of the weights. An empty payload requests the newest weights."""
+"""Payload of a policy request for the weights to evaluate, by default their running mean. An empty payload requests
+the newest weights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,13 +8,11 @@ import numpy.typing as npt
 
 from common.env.robot import RobotBatch
 from common.physics.flight import Flight
-from common.rally.hit_correction import BACK, corrections
+from common.rally.hit_correction import BACK, DriveHistories, corrections
 from common.rally.state import Rallies, RobotMotion
 
 Floats = npt.NDArray[np.float32]
 Rows = npt.NDArray[np.int64]
-
-AT_LIMIT: Final = 1.0 - 1e-9  # [-] share of a drive's largest force from which on it counts as at its limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +40,9 @@ class HitCorrector:
     def __init__(self, robot: RobotBatch, flight: Flight) -> None:
         self._flight_model = int(flight)
         self._drives = robot.drives
-        self._largest = robot.torque_limit * AT_LIMIT
-        self._limited = np.zeros((robot.count, BACK, robot.substeps, 7), np.bool_)
+        self._robot = robot
+        self._limits = np.zeros((robot.count, BACK, robot.substeps, 7), np.int8)
+        self._losses = np.zeros((robot.count, BACK, robot.substeps, 7), np.float32)
         self._newest = 0
         self._found = np.zeros((robot.count, BACK, 7))
         self._steps = np.zeros(robot.count, np.int64)
@@ -51,17 +50,15 @@ class HitCorrector:
     def update(self, rallies: Rallies, motion: RobotMotion, corrects: bool) -> HitCorrections:
         """Record one control step of all robots, and return the corrections of its hits if ``corrects``."""
         self._newest = (self._newest + 1) % BACK
-        self._limited[:, self._newest] = np.abs(motion.torque) >= self._largest
+        self._limits[:, self._newest], self._losses[:, self._newest] = self._robot.limits(motion)
         if not corrects:
             return NO_HIT_CORRECTIONS
         corrections(
+            self._robot.chain,
             rallies.hit,
             rallies.parameters,
             self._flight_model,
-            self._limited,
-            self._newest,
-            self._drives,
-            motion.step,
+            DriveHistories(self._limits, self._losses, self._newest, self._drives, motion.step),
             self._found,
             self._steps,
         )

@@ -11,14 +11,16 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from common.env.robot import MODEL_PATH, RobotBatch, limit_speeds
+from common.env.robot import RobotBatch
 from common.jit import kernel
 from common.physics import touch
-from common.physics.arm import joints_at, racket_pose, speed_bound
+from common.physics.chain import Chain, joints_at, racket_pose, speed_bound
 from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS, GRAVITY, GRID_STEP, TABLE_FRICTION
 from common.physics.flight import acceleration
 from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, vec_at
-from common.task.config import RobotName
+from common.robot.chain_of import capsule_names
+from common.robot.description import describe
+from common.robot.model import robot_xml
 from common.task.randomization import air_of
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +33,7 @@ SUBSTEPS = round(GRID_STEP / STEP)  # in a grid step
 # Substeps with the same force of the air. If it lasted 5 ms, the force on the incoming ball would act on the ball that
 # was hit
 AIR_SUBSTEPS = 2
-CLEARANCE = 0.010  # [m] MuJoCo's beam has corners, 8 mm beyond ours
+CLEARANCE = 0.002  # [m] for the gap's error at the speeds of a step's start
 # [m/s] how much the closing speed may grow in 5 ms: 1.8 m/s with all drives at their force limits, and a margin
 SPEEDING_UP = 3.0
 
@@ -57,26 +59,36 @@ HARD: Final = Surface(1.0e6, 17.0, TABLE_FRICTION)
 # sticks. MuJoCo can only brake the slip. It can't reverse it as rubber does
 RUBBER: Final = Surface(4.0e6, 280.0, 1.0)
 
-# Geom, the touch that it means (for the table it depends on the place), and its surface
-OBSTACLES: Final[tuple[tuple[str, touch.Touch, Surface], ...]] = (
-    ("racket", touch.Touch.RACKET, RUBBER),
-    ("table", touch.Touch.ROBOT_COURT, HARD),
-    ("net", touch.Touch.NET, HARD),
-    ("floor", touch.Touch.FLOOR, HARD),
-    ("upper_arm", touch.Touch.BODY, HARD),
-    ("forearm", touch.Touch.BODY, HARD),
-    ("wrist", touch.Touch.BODY, HARD),
-    ("handle", touch.Touch.BODY, HARD),
-    ("column", touch.Touch.BODY, HARD),
-    ("beam", touch.Touch.BODY, HARD),
-)
+
+class Obstacle(NamedTuple):
+    """A geom that the ball can touch."""
+
+    geom: str
+    touch: touch.Touch  # what a contact means; for the table it depends on the place
+    surface: Surface
+
+
+RACKET_ROW: Final = 0  # of ``obstacles``
+
+
+def obstacles(name: str) -> list[Obstacle]:
+    """Return what the ball can touch in the model of a robot: racket, surroundings, and the robot's other parts."""
+    return [
+        Obstacle(describe(name).racket, touch.Touch.RACKET, RUBBER),
+        Obstacle("table", touch.Touch.ROBOT_COURT, HARD),
+        Obstacle("net", touch.Touch.NET, HARD),
+        Obstacle("floor", touch.Touch.FLOOR, HARD),
+        *(Obstacle(geom, touch.Touch.BODY, HARD) for geom in capsule_names(name)),
+    ]
+
+
 BALL_POS, BALL_QUAT, BALL_VEL, BALL_SPIN = 7, 10, 7, 10  # first columns in qpos and qvel
 _PARKED = (5.0, 0.0, -0.7, 1.0, 0.0, 0.0, 0.0)  # out of play: a failure of the simulation ends the rally
 
 
-def load_model(preset: RobotName) -> mujoco.MjModel:
+def load_model(name: str) -> mujoco.MjModel:
     """Return the compiled robot with the ball: a free body after the robot's seven joints."""
-    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec = mujoco.MjSpec.from_string(robot_xml(name))
     spec.option.timestep = STEP
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     ball = spec.worldbody.add_body(name="ball")
@@ -89,7 +101,7 @@ def load_model(preset: RobotName) -> mujoco.MjModel:
         contype=0,  # contacts by explicit pairs only
         conaffinity=0,
     )
-    for geom, _, surface in OBSTACLES:
+    for geom, _, surface in obstacles(name):
         spec.add_pair(
             name=f"ball on {geom}",
             geomname1="ball",
@@ -110,9 +122,7 @@ def load_model(preset: RobotName) -> mujoco.MjModel:
         )
     home = spec.keys[0]
     home.qpos = np.concatenate([home.qpos, _PARKED])
-    model = spec.compile()
-    limit_speeds(model, preset)
-    return model
+    return spec.compile()
 
 
 @kernel
@@ -147,10 +157,11 @@ def _closes(gap: float, normal: Vec, vel: Vec, robot_speed: float) -> bool:
 
 
 @kernel
-def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
+def _within_reach(chain: Chain, qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
     """Write which balls may touch an obstacle within a grid step.
 
     Args:
+        chain: Of the robots.
         qpos: Positions (B, 14).
         qvel: Velocities (B, 13).
         path: Scratch (2, 7).
@@ -171,13 +182,13 @@ def _within_reach(qpos: Array, qvel: Array, path: Array, out: Flags) -> None:
             continue
         for j in range(7):
             path[0, j], path[1, j] = qpos[b, j], qpos[b, j] + GRID_STEP * qvel[b, j]
-        speed = speed_bound(path, GRID_STEP)
+        speed = speed_bound(chain, path, GRID_STEP)
         q = joints_at(path, 0.0, GRID_STEP)
         anywhere = norm(vel) + speed  # the arm is not convex: the direction does not count
-        if not _closes(touch.robot_gap_bound(pos, q), no_normal, vel, anywhere):
+        if not _closes(touch.robot_gap_bound(pos, chain, q), no_normal, vel, anywhere):
             continue
-        racket, on_racket = touch.racket_gap(pos, racket_pose(q))
-        body = touch.body_gap(pos, q)[0]
+        racket, on_racket = touch.racket_gap(pos, racket_pose(chain, q))
+        body = touch.body_gap(pos, chain, q)[0]
         out[b] = _closes(racket, on_racket, vel, speed) or _closes(body, no_normal, vel, anywhere)
 
 
@@ -193,16 +204,16 @@ class RobotAndBall(RobotBatch):
 
     Args:
         count: B.
-        preset: See ``robot.load_model``.
+        name: Of the robot.
         control_rate_hz: Control steps a second.
         flight_model: ``flight.SIMPLE`` or ``flight.FULL``.
         threads: MuJoCo threads.
     """
 
     def __init__(
-        self, count: int, preset: RobotName, control_rate_hz: float, flight_model: int, threads: int = 1
+        self, count: int, name: str, control_rate_hz: float, flight_model: int, threads: int = 1
     ) -> None:
-        super().__init__(count, preset, control_rate_hz, STEP, threads, load_model(preset))
+        super().__init__(count, name, control_rate_hz, STEP, threads, load_model(name))
         self.ball_force: Array = self._wrench[:, self.model.body("ball").id]
         self.qpos: Array = self.batch.bind("qpos")
         self.qvel: Array = self.batch.bind("qvel")
@@ -225,7 +236,7 @@ class RobotAndBall(RobotBatch):
 
     def _advance(self, control: Array) -> dict[str, Array]:
         for first in range(0, self.substeps, SUBSTEPS):
-            _within_reach(self.qpos, self.qvel, self._path, self._is_near)
+            _within_reach(self.chain, self.qpos, self.qvel, self._path, self._is_near)
             whole = slice(first, first + SUBSTEPS)
             near, far = np.flatnonzero(self._is_near), np.flatnonzero(~self._is_near)
             for k in range(first, whole.stop if near.size else first, AIR_SUBSTEPS):

@@ -8,7 +8,7 @@ MuJoCo's contacts are springs. A contact lasts several substeps, and the ball si
 m/s. Half the racket's thickness and the ball's radius are together 26.5 mm, so no ball passes below 50 m/s.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +18,15 @@ from common.env.mujoco_ball import (
     BALL_QUAT,
     BALL_SPIN,
     BALL_VEL,
-    OBSTACLES,
+    RACKET_ROW,
     RobotAndBall,
+    obstacles,
     to_world,
 )
 from common.env.robot import RobotBatch
 from common.jit import kernel
 from common.physics import touch
-from common.physics.arm import joint_rates_at, joints_at, point_velocity, racket_motion, racket_pose
+from common.physics.chain import joint_rates_at, joints_at, point_velocity, racket_state
 from common.physics.constants import BALL_RADIUS, GRID_STEP
 from common.physics.fly import Segment
 from common.physics.vec import axpy
@@ -41,25 +42,28 @@ Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 FREE_SUBSTEPS: Final = 4  # a contact that opens for up to 2 ms is still the same contact
-# Touch sensors of the robot that also measure the ball, as (sensor, obstacle). The penalty F_c does not count the ball
-_SENSES_BALL: Final = ((0, 4), (1, 5), (2, 6), (3, 0), (3, 7))
-_RACKET_ROW: Final = 0  # of OBSTACLES
-_TOUCHES: Final = tuple(int(what) for _, what, _ in OBSTACLES)
-_ROBOT_SENSORS: Final = 4
 
 _TAU_1, _TAU_2, _TAU_3 = int(State.TAU_1), int(State.TAU_2), int(State.TAU_3)
 _TAU_23 = int(State.TAU_23)
 _RACKET, _TABLE, _OUT = int(touch.RACKET), int(touch.ROBOT_COURT), int(touch.OUT)
 
 
+class BallRecords(NamedTuple):
+    """MuJoCo's records of one control step, and what is known of the obstacles."""
+
+    qpos: Array  # (B, n, 14)
+    qvel: Array  # (B, n, 13)
+    found: Array  # (B, n, obstacles) contacts with each of ``obstacles`` at the start of each substep
+    free: Rows  # (B, obstacles) substeps since the last contact with each; written
+    touches: Rows  # (obstacles,) ``touch.Touch`` of each
+    senses: Rows  # (links, 2) touch sensors that also measure the ball, and on which obstacle
+
+
 @kernel
 def _follow(
     rallies: Rallies,
     b: int,
-    qpos: Array,
-    qvel: Array,
-    found: Array,
-    free: Rows,
+    records: BallRecords,
     motion: RobotMotion,
     rules: Rules,
     profile: RandomizationProfile,
@@ -70,15 +74,14 @@ def _follow(
     Args:
         rallies: Row b is written.
         b: Row.
-        qpos: Recorded positions (n, 14).
-        qvel: Recorded velocities (n, 13).
-        found: Contacts with each of OBSTACLES at the start of each substep (n, obstacles).
-        free: Substeps since the last contact with each obstacle; written.
+        records: Row b of ``free`` is written.
         motion: The robots' motion.
         rules: The rules.
         profile: Noise and rate of the camera.
         path: Robot b's joint positions (n + 1, 7).
     """
+    qpos, qvel, found, free = records.qpos[b], records.qvel[b], records.found[b], records.free[b]
+    touches = records.touches
     ball = rallies.ball[b]
     pos, vel, spin = (ball[0], ball[1], ball[2]), (ball[3], ball[4], ball[5]), (ball[6], ball[7], ball[8])
     state, outcome = rallies.state[b], 0
@@ -97,15 +100,14 @@ def _follow(
             free[obstacle] = 0 if found[k, obstacle] > 0.0 else free[obstacle] + 1
             if not is_new or outcome != 0:
                 continue
-            what = _TOUCHES[obstacle]
+            what = touches[obstacle]
             if what == _TABLE:
                 what = touch.table_touch(pos)
             elif what == _RACKET and state != _TAU_2:
                 moment = k * motion.step
                 joints = joints_at(path, moment, motion.step)
-                pose = racket_pose(joints)
                 rates = joint_rates_at(path, moment, motion.step)
-                racket_vel, racket_spin = racket_motion(joints, rates)
+                pose, racket_vel, racket_spin = racket_state(rules.chain, joints, rates)
                 contact = axpy(-BALL_RADIUS, touch.racket_gap(pos, pose)[1], pos)
                 surface_vel = point_velocity(pose.centre, racket_vel, racket_spin, contact)
                 racket_speed = min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED)
@@ -129,7 +131,7 @@ def _follow(
                     Segment(p0, v0, pos, vel, motion.step),
                 )
             spin = to_world(qpos[k, BALL_QUAT:], (w[0], w[1], w[2]))
-            if is_pressed and free[_RACKET_ROW] > 0:
+            if is_pressed and free[RACKET_ROW] > 0:
                 write_departure(rallies.hit[b], pos, vel, spin)
                 is_pressed = False
             if abs(pos[0]) > touch.PLAY_X or abs(pos[1]) > touch.PLAY_Y:
@@ -148,10 +150,7 @@ def _follow(
 def _play_records(
     rallies: Rallies,
     motion: RobotMotion,
-    qpos: Array,
-    qvel: Array,
-    found: Array,
-    free: Rows,
+    records: BallRecords,
     actions: Array,
     rules: Rules,
     profile: RandomizationProfile,
@@ -161,11 +160,12 @@ def _play_records(
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
         copy_path(motion, b, path)
-        for k in range(found.shape[1]):
-            for sensor, obstacle in _SENSES_BALL:
-                if found[b, k, obstacle] > 0.0:
-                    motion.contact[b, k, sensor] = 0.0
-        result = _follow(rallies, b, qpos[b], qvel[b], found[b], free[b], motion, rules, profile, path)
+        found, senses = records.found[b], records.senses
+        for k in range(found.shape[0]):
+            for row in range(senses.shape[0]):
+                if found[k, senses[row, 1]] > 0.0:
+                    motion.contact[b, k, senses[row, 0]] = 0.0
+        result = _follow(rallies, b, records, motion, rules, profile, path)
         finish_step(rallies, b, result, motion, actions, rules, profile, path, step)
 
 
@@ -175,7 +175,12 @@ class MujocoContacts:
     def __init__(self, robot: RobotAndBall) -> None:
         self.robot: RobotBatch = robot
         self._simulation = robot
-        self._free = np.zeros((robot.count, len(OBSTACLES)), np.int64)
+        found, links = obstacles(robot.name), robot.description.links
+        self._touches = np.array([int(obstacle.touch) for obstacle in found])
+        # Touch sensors of links that also measure the ball: (sensor, obstacle). The penalty F_c does not count the ball
+        geoms = [obstacle.geom for obstacle in found]
+        self._senses = np.array([[k, geoms.index(link)] for k, link in enumerate(links)])
+        self._free = np.zeros((robot.count, len(found)), np.int64)
 
     def launch(self, rallies: Rallies, rows: Rows) -> None:
         """Put the rallies' balls into the simulation."""
@@ -193,20 +198,10 @@ class MujocoContacts:
     ) -> None:
         """Play one control step. In MuJoCo the ball itself pushes the racket."""
         motion = self._simulation.step(actions)
-        records = self._simulation.records
+        played = self._simulation.records
         robot_motion = self.motion = motion._replace(
-            joint_pos=records["qpos"][:, :, :7], contact=records["sensordata"][:, :, :_ROBOT_SENSORS]
+            joint_pos=played["qpos"][:, :, :7], contact=motion.contact
         )
-        found = records["sensordata"][:, :, _ROBOT_SENSORS:]
-        _play_records(
-            rallies,
-            robot_motion,
-            records["qpos"],
-            records["qvel"],
-            found,
-            self._free,
-            actions,
-            rules,
-            profile,
-            step,
-        )
+        found = played["sensordata"][:, :, -len(self._touches) :]
+        records = BallRecords(played["qpos"], played["qvel"], found, self._free, self._touches, self._senses)
+        _play_records(rallies, robot_motion, records, actions, rules, profile, step)

@@ -14,13 +14,13 @@ from common.env.robot import RobotBatch
 from common.jit import kernel
 from common.perception.flight_track import new_tracks
 from common.rally.observe import observation_flags, observe
-from common.rally.state import NO_SAMPLE, RING, Rallies, Rules, allocate
+from common.rally.state import NO_SAMPLE, RING, Rallies, RobotMotion, Rules, allocate
 from common.rally.step import launch_rallies
 from common.task.config import TaskConfig
 from common.task.counter_rng import Stream, between, uniform
 from common.task.experience import ExperienceConfig
 from common.task.observation import ACTION_SIZE, ObservationConfig, critic_layout, policy_layout, size
-from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
+from common.task.randomization import RallyParameter, RandomizationProfile, profile_of
 from common.task.reward import reward_table
 from common.task.states import Outcome, transition_table
 
@@ -64,7 +64,7 @@ class FinishedRallies:
     validated: Flags  # (n,)
     returns: Floats  # (n,) undiscounted reward of the rally
     lengths: npt.NDArray[np.int32]  # (n,) control steps
-    parameters: Array  # (n, 14) randomization.RallyParameter
+    parameters: Array  # (n, 15) randomization.RallyParameter
     rounds: npt.NDArray[np.int32]  # (n,) which rally of its episode: 1 for the first
 
 
@@ -125,6 +125,7 @@ class RallyEnv:
         path_rows: Samples of a recorded track that drives a ball until it is hit. 0: physics alone moves the balls.
         extra_observation: Options of a second observation of the same rallies (``observe_extra``), such as a teacher's.
             Its history is not longer than the task's.
+        keeps_hits: Whether ``rallies.hit`` is written although hits are not corrected.
     """
 
     def __init__(
@@ -138,6 +139,7 @@ class RallyEnv:
         threads: int = 1,
         path_rows: int = 0,
         extra_observation: ObservationConfig | None = None,
+        keeps_hits: bool = False,
     ) -> None:
         if path_rows and task.collision == "original":
             raise ValueError("recorded tracks under collision 'original'; allowed: collision 'tailored'")
@@ -146,7 +148,7 @@ class RallyEnv:
         self.experience = experience
         self._contacts = self._make_contacts(threads)
         self.robot = self._contacts.robot
-        self._profile = PROFILES[task.randomization]
+        self._profile = profile_of(task.randomization, task.rubber)
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
         self._hit_corrector = (
@@ -159,7 +161,7 @@ class RallyEnv:
             task.observation.history,
             has_camera=task.perception == "full",
             tracks=self._new_tracks(),
-            keeps_hits=experience.hit_correction,
+            keeps_hits=experience.hit_correction or keeps_hits,
             path_rows=path_rows,
         )
         self._validated = np.zeros(count, np.bool_)
@@ -192,6 +194,7 @@ class RallyEnv:
             grid_steps=task.grid_steps,
             time_limit=task.time_limit_s,
             flight_model=int(task.flight_model),
+            chain=self.robot.chain,
         )
 
     @property
@@ -203,6 +206,11 @@ class RallyEnv:
     def rallies(self) -> Rallies:
         """The rallies in play, for rendering and tests. Read only."""
         return self._rallies
+
+    @property
+    def motion(self) -> RobotMotion:
+        """The robots' motion in the last control step."""
+        return self._contacts.motion
 
     def reset(self) -> Floats:
         """Start every environment again, robots at home and opponents unknown, and return the observations (B, D)."""
@@ -271,7 +279,15 @@ class RallyEnv:
             )
         extra = np.empty((self.count, size(policy_layout(self._extra_observation))), np.float32)
         flags = observation_flags(self._extra_observation)._replace(is_privileged=False)
-        observe(self._rallies, self._all, self.robot.joint_pos, self.robot.joint_vel, flags, extra)
+        observe(
+            self._rallies,
+            self._all,
+            self.robot.joint_pos,
+            self.robot.joint_vel,
+            self.robot.chain,
+            flags,
+            extra,
+        )
         return extra
 
     def _make_contacts(self, threads: int) -> Contacts:
@@ -292,7 +308,7 @@ class RallyEnv:
     def _observe(self, rows: Rows) -> None:
         """Write the observations of ``rows``."""
         robot = self.robot
-        observe(self._rallies, rows, robot.joint_pos, robot.joint_vel, self._flags, self._obs)
+        observe(self._rallies, rows, robot.joint_pos, robot.joint_vel, robot.chain, self._flags, self._obs)
 
     def _finish(self, rows: Rows) -> FinishedRallies:
         r = self._rallies

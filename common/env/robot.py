@@ -2,55 +2,32 @@
 
 import logging
 import math
-from pathlib import Path
 
 import mujoco
 import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
 
+from common.physics.chain import JOINTS, Chain
+from common.rally.hit_correction import CURRENT, FREE, VOLTAGE
 from common.rally.state import RobotMotion
-from common.task.config import RobotName
+from common.robot.chain_of import chain_of
+from common.robot.description import RobotDescription, describe
+from common.robot.model import CUBIC_LOSS, LINEAR_LOSS, NO_LOAD, STALL, load_model
 
 log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
-MODEL_PATH = Path(__file__).with_name("robot.xml")
 # [s] tests/unit/env/test_robot.py states the racket's error against steps of 0.25 ms (ADR-0005)
 MUJOCO_STEP = 0.004
 MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: at 100 Hz and 200 Hz
-JOINTS = ("rail_x", "rail_y", "yaw", "pitch", "elbow", "wrist", "roll")
-RACKET_BODY = "racket"
 _START_TIME = 1.0  # [s] MuJoCo's time at the start of each control step; a reset simulation starts at 0 again
 MAX_ACTION_LATENCY = 0.020  # [s] targets are kept so long: the longest action latency of all profiles
-
-# Published speed limits of the authors' robot: rails [m/s]; yaw and pitch, then the last three joints [rad/s]
-USST_SPEED_LIMITS = (2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86)
-
-
-def load_model(preset: RobotName = "rails", step: float = MUJOCO_STEP) -> mujoco.MjModel:
-    """Return the compiled robot.
-
-    Args:
-        preset: ``rails`` (our robot) or ``usst`` (the same with the published joint speeds of the authors' robot).
-        step: MuJoCo's time step [s].
-    """
-    model = mujoco.MjModel.from_xml_path(str(MODEL_PATH))
-    model.opt.timestep = step
-    limit_speeds(model, preset)
-    return model
-
-
-def limit_speeds(model: mujoco.MjModel, preset: RobotName) -> None:
-    """Limit the speeds of the robot's joints to those of a preset, in place.
-
-    MuJoCo has no speed limit. So the damping is set to balance the drive's largest force at the limit.
-    """
-    if preset == "usst":
-        for joint, limit in enumerate(USST_SPEED_LIMITS):
-            model.dof_damping[joint] = model.actuator_forcerange[joint, 1] / limit
+_KP, _KV = 4, 6  # columns of a dcmotor's gain parameters
+# [-] of a drive's largest force: a force so near a limit of current or voltage does not depend on the target
+_AT_CURRENT, _AT_VOLTAGE = 1e-9, 0.02
 
 
 def inertia_at_home(model: mujoco.MjModel) -> Array:
@@ -63,14 +40,12 @@ def inertia_at_home(model: mujoco.MjModel) -> Array:
     return inertia[:7, :7]
 
 
-def home_action(preset: RobotName = "rails") -> npt.NDArray[np.float32]:
-    """Return the action (7,) that holds the home pose."""
-    model = load_model(preset)
-    limits = np.array(model.actuator_ctrlrange)
-    middle = limits.mean(axis=1)
-    action: npt.NDArray[np.float32] = ((model.key("home").qpos - middle) / (limits[:, 1] - middle)).astype(
-        np.float32
-    )
+def home_action(name: str = "rails") -> npt.NDArray[np.float32]:
+    """Return the action (7,) that holds the home pose of a robot."""
+    joints = describe(name).joint
+    low, high = np.array([joint.range for joint in joints]).T
+    home = np.array([joint.home for joint in joints])
+    action: npt.NDArray[np.float32] = ((home - 0.5 * (low + high)) / (0.5 * (high - low))).astype(np.float32)
     return action
 
 
@@ -79,7 +54,7 @@ class RobotBatch:
 
     Args:
         count: B.
-        preset: See ``load_model``.
+        name: Of the robot (``common/robot``).
         control_rate_hz: Control steps a second. The control period must be a multiple of MuJoCo's step.
         step: MuJoCo's time step [s]; None: the default for this control rate.
         threads: MuJoCo threads. With 1 an actor uses one core.
@@ -89,7 +64,7 @@ class RobotBatch:
     def __init__(
         self,
         count: int,
-        preset: RobotName = "rails",
+        name: str = "rails",
         control_rate_hz: float = 50.0,
         step: float | None = None,
         threads: int = 1,
@@ -107,25 +82,29 @@ class RobotBatch:
             raise ValueError(f"control period {period} s is not a multiple of the MuJoCo step {step} s")
         self.step_s = step
         self.count = count
-        self.model = load_model(preset, step) if model is None else model
+        self.model = load_model(name, step) if model is None else model
+        self.name = name
+        self.description: RobotDescription = describe(name)
+        self.chain: Chain = chain_of(name)
         self.batch = Batch(self.model, count, threads)
         self.joint_pos: Array = self.batch.bind("qpos")[:, :7]
         self.joint_vel: Array = self.batch.bind("qvel")[:, :7]
         self._ctrl: Array = self.batch.bind("ctrl")
         self._wrench: Array = self.batch.bind("xfrc_applied")
-        self._racket = self.model.body(RACKET_BODY).id
-        limits = np.array(self.model.actuator_ctrlrange)
+        self._racket = self.model.geom_bodyid[self.model.geom(self.description.racket).id]
+        joints = self.description.joint
+        limits = np.array([joint.range for joint in joints])
         self.middle: Array = limits.mean(axis=1)
         self.half_range: Array = limits[:, 1] - self.middle
-        self.torque_limit: Array = np.array(self.model.actuator_forcerange[:, 1])
-        self.home: Array = np.array(self.model.key("home").qpos[:7])
+        self.torque_limit: Array = np.array([joint.force for joint in joints])
+        self.speed_limit: Array = np.array([joint.speed for joint in joints])
+        self.home: Array = np.array([joint.home for joint in joints])
         self.home_action: Array = (self.home - self.middle) / self.half_range
         # Gains and damping differ between rallies
-        self._kp: Array = np.array(self.model.actuator_gainprm[:, 0])
-        self._kv: Array = -np.array(self.model.actuator_biasprm[:, 2])
-        self._damping_nominal: Array = np.array(self.model.dof_damping[:7])
+        self._kp: Array = np.array([joint.kp for joint in joints])
+        self._kv: Array = np.array([joint.kv for joint in joints])
+        self._damping_nominal: Array = np.array(self.model.dof_damping[:JOINTS])
         self._gain: Array = self.batch.expand("actuator_gainprm")
-        self._bias: Array = self.batch.expand("actuator_biasprm")
         self._damping: Array = self.batch.expand("dof_damping")
         self._time: Array = self.batch.bind("time")
         self.faulty: Rows = np.zeros(0, np.int64)
@@ -136,8 +115,9 @@ class RobotBatch:
         self._late_substeps = np.zeros(count, np.int64)
         self._substep_index = np.arange(self.substeps)
         self._control = np.empty((count, self.substeps, 7))
-        self._start = np.empty((count, 7))
+        self._start, self._start_vel = np.empty((count, 7)), np.empty((count, 7))
         self._records: dict[str, Array] = {}
+        self.sensors: Array = np.zeros((count, self.substeps, self.model.nsensordata))
         self.go_home(np.arange(count), np.zeros((count, 7)))
 
     def go_home(self, rows: Rows, offset: Array) -> None:
@@ -148,18 +128,35 @@ class RobotBatch:
 
     def set_gains(self, rows: Rows, factors: Array, action_latency: Array) -> None:
         """Set the drives of robots ``rows``: factors of kp, kv and damping (n, 3, 7), action latency [s] (n,)."""
-        kp = self._kp * factors[:, 0]
-        self._gain[rows, :, 0] = kp
-        self._bias[rows, :, 1] = -kp
-        self._bias[rows, :, 2] = -self._kv * factors[:, 1]
+        self._gain[rows, :, _KP] = self._kp * factors[:, 0]
+        self._gain[rows, :, _KV] = self._kv * factors[:, 1]
         self._damping[rows, :7] = self._damping_nominal * factors[:, 2]
         self._late_substeps[rows] = np.rint(action_latency / self.step_s).astype(np.int64)
 
     @property
     def drives(self) -> Array:
-        """The drives (5, 7) as in ``DriveHistory.drives``: inertia at home, k_p, k_v, joint damping, half-range."""
+        """The drives (5, 7) as in ``DriveHistory.drives``."""
         inertia = np.diag(inertia_at_home(self.model))
-        return np.stack([inertia, self._kp, self._kv, self._damping_nominal, self.half_range])
+        back_emf = STALL / NO_LOAD * self.torque_limit / self.speed_limit
+        return np.stack([inertia, self._kp, self._kv, self.half_range, back_emf])
+
+    def limits(self, motion: RobotMotion) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
+        """Return what ``DriveHistory`` keeps of a control step's substeps.
+
+        Returns:
+            What limited each drive (B, n, 7): ``hit_correction.FREE``, CURRENT or VOLTAGE; and the slope of its losses
+            and its speed (B, n, 7).
+        """
+        force = motion.torque / self.torque_limit
+        path = np.concatenate([motion.start_pos[:, None], motion.joint_pos[:, :-1]], axis=1)
+        # at the start of each substep, where MuJoCo computes the force
+        speed = np.concatenate([self._start_vel[:, None], np.diff(path, axis=1) / motion.step], axis=1)
+        speed /= self.speed_limit
+        by_voltage = STALL * (1.0 - np.abs(speed) / NO_LOAD)
+        limits = np.where(force * np.sign(speed) >= by_voltage - _AT_VOLTAGE, VOLTAGE, FREE).astype(np.int8)
+        limits[np.abs(force) >= 1.0 - _AT_CURRENT] = CURRENT
+        losses = (LINEAR_LOSS + 3.0 * CUBIC_LOSS * speed * speed) * (self.torque_limit / self.speed_limit)
+        return limits, losses.astype(np.float32)
 
     def push_racket(self, impulse: Array) -> None:
         """Apply impulses (B, 6) [N s, N m s] at the racket's centre, spread over the next control step."""
@@ -172,6 +169,7 @@ class RobotBatch:
         """
         target = self.middle + self.half_range * actions
         self._start[:] = self.joint_pos
+        self._start_vel[:] = self.joint_vel
         self._time[:] = _START_TIME
         np.copyto(self._control, target[:, None, :])
         for age, earlier in enumerate(self._earlier_targets):
@@ -185,7 +183,9 @@ class RobotBatch:
         self.faulty = np.flatnonzero(~(np.abs(missing_time) < 0.5 * self.step_s))
         if self.faulty.size:
             self._recover(self.faulty)
-        return RobotMotion(self._start, r["qpos"], r["actuator_force"], r["sensordata"], self.step_s)
+        self.sensors = r["sensordata"]
+        touched = self.sensors[:, :, : len(self.description.links)]
+        return RobotMotion(self._start, r["qpos"], r["actuator_force"], touched, self.step_s)
 
     def _advance(self, control: Array) -> dict[str, Array]:
         """Return MuJoCo's records (B, substeps, ...) of a control step under joint targets (B, substeps, 7)."""

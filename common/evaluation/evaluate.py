@@ -12,7 +12,9 @@ from common.errors import ReportedError
 from common.evaluation.breakdown import breakdown, survival, table
 from common.evaluation.match import MatchConfig, environments, evaluation_rallies, match_task, play_match
 from common.evaluation.measures import measures
+from common.evaluation.robot_measures import robot_measures
 from common.policy.folder import Policy
+from common.robot.description import describe
 
 
 class StoppedError(ReportedError):
@@ -42,10 +44,16 @@ def measure(
         "collision": task.collision,
         "perception": task.perception,
         "expected_spin": task.observation.expected_spin,
+        "end_to_end": policy.contract.is_end_to_end,
         "policy": str(folder),
         "seconds": round(time.monotonic() - started, 2),
     }
-    return measures(result) | survival(result) | match | {"by": breakdown(result)}
+    robot = describe(task.robot)
+    strain = {}
+    if result.robot is not None and len(result.seeds):
+        names = [joint.name for joint in robot.joint]
+        strain = {"robot": {"name": task.robot} | robot_measures(result.robot, robot.links, names)}
+    return measures(result) | survival(result) | match | strain | {"by": breakdown(result)}
 
 
 def print_measures(found: dict[str, Any], as_json: bool) -> None:

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from common.env.rally_env import FinishedRallies, Launches, RallyEnv
 from common.evaluation.measures import MatchResult
+from common.evaluation.robot_measures import RobotMonitor
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.policy.contract import Contract
 from common.policy.folder import Policy
@@ -126,13 +127,18 @@ def play_match(
     plain = TaskConfig(randomization=task.randomization)
     filler = draw_rallies(64, plain, seed=0, purpose=Purpose.FALLBACK)
     source = FixedRallies(rallies, filler)
-    env = RallyEnv(envs, task, source, stage=3, experience=MATCH, path_rows=rallies.path_rows)
+    env = RallyEnv(
+        envs, task, source, stage=3, experience=MATCH, path_rows=rallies.path_rows, keeps_hits=True
+    )
+    monitor = RobotMonitor(env)
     obs = env.reset()
     ended: list[FinishedRallies] = []
     left = len(rallies.seeds)
     while left > 0:
         on_tick()
-        step = env.step(policy.act(obs))
+        actions = policy.act(obs)
+        step = env.step(actions)
+        monitor.update(actions, step)
         obs = step.obs
         if step.finished.rows.size:
             ended.append(step.finished)
@@ -158,6 +164,7 @@ def play_match(
         targets=parameters[:, [RallyParameter.TARGET_X, RallyParameter.TARGET_Y]],
         bounces=bounces[:, :2],
         arrivals=arrivals,
+        robot=monitor.record(),
     )
 
 

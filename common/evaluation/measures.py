@@ -7,11 +7,12 @@ return after catch = return / catch; target error = planar distance of legal lan
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from common.evaluation.robot_measures import RobotRecord
 from common.task.states import Outcome
 
 Array = npt.NDArray[np.float64]
@@ -38,18 +39,22 @@ class MatchResult:
     arrivals: (
         Array  # (n, 3) [m] at the end of the table, unplayed; nan where the ball bounces twice before it
     )
+    robot: RobotRecord | None = None  # what the robot did, in the same order
 
     def of(self, chosen: npt.NDArray[np.bool_]) -> "MatchResult":
         """Return the rallies that ``chosen`` (n,) marks."""
-        return MatchResult(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+        rows = {name: getattr(self, name)[chosen] for name in _COLUMNS}
+        return MatchResult(**rows, robot=None if self.robot is None else self.robot.of(chosen))
 
     @staticmethod
     def together(parts: Sequence["MatchResult"]) -> "MatchResult":
         """Return the rallies of several matches as one."""
-        names = [field.name for field in fields(MatchResult)]
-        return MatchResult(
-            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        )
+        rows = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        robots = [part.robot for part in parts if part.robot is not None]
+        return MatchResult(**rows, robot=RobotRecord.together(robots) if robots else None)
+
+
+_COLUMNS: Final = [field.name for field in fields(MatchResult) if field.name != "robot"]
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:

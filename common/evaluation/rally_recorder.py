@@ -5,7 +5,7 @@ between them a cubic interpolates their positions and velocities.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -50,6 +50,7 @@ class RecordedRally:
     measurement: Array = field(default_factory=lambda: np.empty((0, SAMPLE + 1)))
     # (s, 5) the camera's detections that arrived: time, position, 1 if accepted; none in perception cheap
     detections: Array = field(default_factory=lambda: np.empty((0, DETECTION)))
+    robot: str = "rails"
 
 
 class _Dealer:
@@ -116,7 +117,7 @@ def record_rallies(act: Act, rallies: RallyBlock, task: TaskConfig) -> list[Reco
                     landing=over.landings[k].astype(np.float64),
                     landing_error=float(over.landing_errors[k]),
                 )
-    return [found[row] for row in range(count)]
+    return [replace(found[row], robot=task.robot) for row in range(count)]
 
 
 def _moment(env: RallyEnv) -> _Moment:

@@ -84,7 +84,7 @@ def unplayed_flight(launches: Array, parameters: Array, flight: Flight) -> tuple
 
     Args:
         launches: As ``launch.RallyBlock.launches`` (n, 11).
-        parameters: ``randomization.RallyParameter`` of the same rallies (n, 14), for air and table.
+        parameters: ``randomization.RallyParameter`` of the same rallies (n, 15), for air and table.
         flight: Model of the aerodynamics.
     """
     bounces, arrivals = np.empty((len(launches), 3)), np.empty((len(launches), 3))

@@ -61,7 +61,8 @@ DRAG_VALUES: Final = np.array(
 DRAG_MIN: Final = 0.3  # [-] our limit: the table ends at 17.5 m/s, and its extrapolation needs one
 
 # Full model: C_M(|v|, |w|), Conti et al. 2026: per speed [m/s], a line m_1 w + c_1 up to w_b, and from there a
-# parabola a w^2 + b w + c (at w_b they differ by up to 0.022)
+# parabola a w^2 + b w + c. At w_b they differ by up to 0.022. So that C_M has no jump, this difference is added to the
+# parabola and falls linearly to 0 within LIFT_BLEND: our addition to the published model
 MAGNUS_SPEEDS: Final = np.array([2.0, 3.5, 7.5, 10.5, 13.5, 17.0])
 MAGNUS_PARAMETERS: Final = np.array(
     [  #  m_1       c_1   w_b      a          b          c
@@ -80,6 +81,7 @@ MAGNUS_PARAMETERS: Final = np.array(
         [-4.48e-4, 0.371, 650.0, -1.000e-7, 2.300e-4, -0.03750],
     ]
 )
+LIFT_BLEND: Final = 50.0  # [rad/s] then the blend is no steeper than the published lines
 
 
 @kernel
@@ -111,7 +113,8 @@ def full_drag(speed: float, spin_parameter: float) -> float:
 def full_magnus(speed: float, spin_rate: float) -> float:
     """Return C_M(|v|, |w|) of the full model [-]: parameters linear in |v|, constant outside 2-17 m/s, never < 0.
 
-    C_M is Conti's coefficient per volume: a = (rho V/m) C_M (w x v); C_L = (8/3) C_M S for a spin across v.
+    It is continuous in the spin: from w_b on it approaches the parabola within ``LIFT_BLEND``. C_M is Conti's
+    coefficient per volume: a = (rho V/m) C_M (w x v); C_L = (8/3) C_M S for a spin across v.
     """
     row = 0
     while row < MAGNUS_SPEEDS.size - 2 and speed >= MAGNUS_SPEEDS[row + 1]:
@@ -120,14 +123,19 @@ def full_magnus(speed: float, spin_rate: float) -> float:
     t = min(1.0, max(0.0, t))
     low, high = MAGNUS_PARAMETERS[row], MAGNUS_PARAMETERS[row + 1]
     w_b = (1.0 - t) * low[2] + t * high[2]
+    m_1: float = (1.0 - t) * low[0] + t * high[0]
+    c_1: float = (1.0 - t) * low[1] + t * high[1]
     if spin_rate <= w_b:
-        m_1: float = (1.0 - t) * low[0] + t * high[0]
-        c_1: float = (1.0 - t) * low[1] + t * high[1]
         return max(0.0, m_1 * spin_rate + c_1)
     a: float = (1.0 - t) * low[3] + t * high[3]
     b: float = (1.0 - t) * low[4] + t * high[4]
     c: float = (1.0 - t) * low[5] + t * high[5]
-    return max(0.0, (a * spin_rate + b) * spin_rate + c)
+    parabola = (a * spin_rate + b) * spin_rate + c
+    beyond = spin_rate - w_b
+    if beyond < LIFT_BLEND:
+        gap = m_1 * w_b + c_1 - ((a * w_b + b) * w_b + c)
+        parabola += gap * (1.0 - beyond / LIFT_BLEND)
+    return max(0.0, parabola)
 
 
 @kernel

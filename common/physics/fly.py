@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from common.jit import kernel
+from common.jit import inlined, kernel
 from common.physics import touch
-from common.physics.arm import Array, joints_at, racket_pose
+from common.physics.chain import Array, Chain, joints_at, racket_pose
 from common.physics.constants import (
     AIR_FACTOR,
     BALL_RADIUS,
@@ -39,7 +39,8 @@ class RobotPath(NamedTuple):
         Array  # (n, 7) joint positions at times 0, step, 2 step ... [m, rad]; without rows there is no robot
     )
     step: float  # [s] between rows
-    speed: float  # [m/s] upper bound for all points of the robot: ``arm.speed_bound``
+    speed: float  # [m/s] upper bound for all points of the robot: ``chain.speed_bound``
+    chain: Chain
 
 
 class Segment(NamedTuple):
@@ -54,14 +55,15 @@ class Segment(NamedTuple):
 
 _NO_JOINTS = np.zeros((0, 7))
 _NO_JOINTS.flags.writeable = False
-NO_ROBOT: Final = RobotPath(_NO_JOINTS, 1.0, 0.0)
+NO_CHAIN: Final = Chain(np.zeros((0, 7)), np.zeros((0, 8)), np.zeros(0), 0, (0.0, 0.0, 0.0), 0.0)
+NO_ROBOT: Final = RobotPath(_NO_JOINTS, 1.0, 0.0, NO_CHAIN)
 
 SMALLEST_MARCH = 2e-5  # [s] 0.6 mm at 30 m/s: a grazing contact of less than 3 um depth may be missed
 _ROOT_TOLERANCE = 1e-12  # [s]
 _TABLE, _NET, _FLOOR, _RACKET, _BODY = 0, 1, 2, 3, 4
 
 
-@kernel
+@inlined
 def path_at(segment: Segment, t: float) -> Vec:
     """Return the position [m] at time ``t`` [s] after the segment's start (error below 1e-8 m)."""
     p0, v0, p1, v1, h = segment
@@ -88,8 +90,8 @@ def _gap(what: int, pos: Vec, robot: RobotPath, moment: float) -> float:
         return touch.floor_gap(pos)[0]
     q = joints_at(robot.joints, moment, robot.step)
     if what == _RACKET:
-        return touch.racket_gap(pos, racket_pose(q))[0]
-    return touch.body_gap(pos, q)[0]
+        return touch.racket_gap(pos, racket_pose(robot.chain, q))[0]
+    return touch.body_gap(pos, robot.chain, q)[0]
 
 
 @kernel
@@ -128,7 +130,7 @@ def _march(what: int, segment: Segment, end: float, closing: float, robot: Robot
     return -1.0
 
 
-@kernel
+@inlined
 def _closing_bound(segment: Segment) -> tuple[float, float]:
     """Return bounds [m/s] of the ball's speed and of its downward speed inside a step."""
     _, v0, _, v1, h = segment
@@ -139,7 +141,7 @@ def _closing_bound(segment: Segment) -> tuple[float, float]:
     return speed + change, max(-v0[2], -v1[2], 0.0) + change
 
 
-@kernel
+@inlined
 def _still_touch(segment: Segment, robot: RobotPath) -> tuple[float, int]:
     """Return time and obstacle of the first touch with an obstacle at rest: table, net or floor; (h, -1) if none."""
     p0, _, p1, _, h = segment
@@ -177,7 +179,7 @@ def _still_touch(segment: Segment, robot: RobotPath) -> tuple[float, int]:
     return first, what
 
 
-@kernel
+@inlined
 def _robot_touch(segment: Segment, end: float, robot: RobotPath, start: float) -> tuple[float, int]:
     """Return time and obstacle of the first touch with the robot before ``end``; (end, -1) if none."""
     p0 = segment.p0
@@ -185,13 +187,13 @@ def _robot_touch(segment: Segment, end: float, robot: RobotPath, start: float) -
     closing = speed + robot.speed
     q = joints_at(robot.joints, start, robot.step)
     first, what = end, -1
-    if touch.robot_gap_bound(p0, q) > closing * end:
+    if touch.robot_gap_bound(p0, robot.chain, q) > closing * end:
         return first, what
-    if touch.racket_gap(p0, racket_pose(q))[0] <= closing * first:
+    if touch.racket_gap(p0, racket_pose(robot.chain, q))[0] <= closing * first:
         t = _march(_RACKET, segment, first, closing, robot, start)
         if t >= 0.0:
             first, what = t, _RACKET
-    if touch.body_gap(p0, q)[0] <= closing * first:
+    if touch.body_gap(p0, robot.chain, q)[0] <= closing * first:
         t = _march(_BODY, segment, first, closing, robot, start)
         if t >= 0.0:
             first, what = t, _BODY
@@ -236,8 +238,8 @@ def fly_step(
         return p, v, end, FLOOR, (0.0, 0.0, 1.0)
     q = joints_at(robot.joints, start + end, robot.step)
     if what == _RACKET:
-        return p, v, end, RACKET, touch.racket_gap(p, racket_pose(q))[1]
-    return p, v, end, BODY, touch.body_gap(p, q)[1]
+        return p, v, end, RACKET, touch.racket_gap(p, racket_pose(robot.chain, q))[1]
+    return p, v, end, BODY, touch.body_gap(p, robot.chain, q)[1]
 
 
 @kernel

@@ -8,9 +8,24 @@ gap / (bound of the closing speed) can't pass through an obstacle, at any thickn
 import math
 from enum import IntEnum
 
-from common.jit import kernel
-from common.physics import arm
-from common.physics.arm import Joints, RacketPose
+import numpy as np
+
+from common.jit import inlined, kernel
+from common.physics.chain import (
+    END,
+    JOINTS,
+    MOVED_BY,
+    RADIUS,
+    START,
+    Chain,
+    Joints,
+    RacketPose,
+    carried_point,
+    next_frame,
+    point_of,
+    row,
+    world_frame,
+)
 from common.physics.constants import (
     BALL_RADIUS,
     FLOOR_Z,
@@ -31,7 +46,7 @@ class Touch(IntEnum):
     OPPONENT_COURT = 2
     NET = 3
     RACKET = 4
-    BODY = 5  # arm, handle, column or beam
+    BODY = 5  # the robot without its racket's blade
     EDGE = 6  # the table's edges and sides
     FLOOR = 7
     OUT = 8  # left the space from which a rally can return
@@ -105,50 +120,54 @@ def racket_gap(pos: Vec, racket: RacketPose) -> tuple[float, Vec]:
     height = dot(offset, racket.normal)
     radial = axpy(-height, racket.normal, offset)
     radius = norm(radial)
-    beyond = radius - (arm.RACKET_RADIUS - arm.RACKET_HALF_THICKNESS)
+    beyond = radius - (racket.radius - racket.half_thickness)
     if beyond <= 0.0:
         normal = racket.normal if height >= 0.0 else scale(-1.0, racket.normal)
-        return abs(height) - arm.RACKET_HALF_THICKNESS - BALL_RADIUS, normal
+        return abs(height) - racket.half_thickness - BALL_RADIUS, normal
     distance = math.sqrt(height * height + beyond * beyond)
     normal = axpy(height / distance, racket.normal, scale(beyond / (radius * distance), radial))
-    return distance - arm.RACKET_HALF_THICKNESS - BALL_RADIUS, normal
+    return distance - racket.half_thickness - BALL_RADIUS, normal
 
 
-@kernel
-def _rail_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
-    """Return gap and normal of beam and column."""
-    x = arm.RAIL_HOME_X + q[0]
-    beam, beam_normal = _capsule_gap(
-        pos, (x, -arm.BEAM_HALF_LENGTH, arm.BEAM_Z), (x, arm.BEAM_HALF_LENGTH, arm.BEAM_Z), arm.BEAM_RADIUS
-    )
-    column, column_normal = _capsule_gap(
-        pos, (x, q[1], arm.BEAM_Z), (x, q[1], arm.SHOULDER_Z), arm.COLUMN_RADIUS
-    )
-    if column < beam:
-        return column, column_normal
-    return beam, beam_normal
-
-
-@kernel
-def body_gap(pos: Vec, q: Joints) -> tuple[float, Vec]:
-    """Return gap and normal of the robot without its racket: beam, column, arm and handle."""
-    gap, normal = _rail_gap(pos, q)
-    p_shoulder, elbow, wrist, handle, _ = arm.links(q)
-    upper, upper_normal = _capsule_gap(pos, p_shoulder, elbow, arm.UPPER_ARM_RADIUS)
-    if upper < gap:
-        gap, normal = upper, upper_normal
-    fore, fore_normal = _capsule_gap(pos, elbow, wrist, arm.FOREARM_RADIUS)
-    if fore < gap:
-        gap, normal = fore, fore_normal
-    hand, hand_normal = _capsule_gap(pos, wrist, handle, arm.WRIST_RADIUS)
-    if hand < gap:
-        gap, normal = hand, hand_normal
+@inlined
+def _part_gap(pos: Vec, start: Vec, end: Vec, radius: float, gap: float, normal: Vec) -> tuple[float, Vec]:
+    """Return the smaller of a gap and the gap to a capsule, with its normal."""
+    to_part, part_normal = _capsule_gap(pos, start, end, radius)
+    if to_part < gap:
+        return to_part, part_normal
     return gap, normal
 
 
 @kernel
-def robot_gap_bound(pos: Vec, q: Joints) -> float:
+def body_gap(pos: Vec, chain: Chain, q: Joints) -> tuple[float, Vec]:
+    """Return gap and normal of the robot without its racket's blade."""
+    gap, normal = np.inf, (0.0, 0.0, 1.0)
+    parts = chain.capsules
+    frame = world_frame()
+    part = 0
+    for joint in range(-1, JOINTS):
+        if joint >= 0:
+            frame = next_frame(chain, joint, q[joint], frame)
+        while part < parts.shape[0] and parts[part, MOVED_BY] == joint:
+            start, end = point_of(frame, row(parts, part, START)), point_of(frame, row(parts, part, END))
+            gap, normal = _part_gap(pos, start, end, parts[part, RADIUS], gap, normal)
+            part += 1
+    return gap, normal
+
+
+@inlined
+def robot_gap_bound(pos: Vec, chain: Chain, q: Joints) -> float:
     """Return a lower bound [m] of the gap to all parts of the robot, computed without trigonometry."""
-    rails, _ = _rail_gap(pos, q)
-    sphere = norm(sub(pos, arm.shoulder(q))) - arm.REACH - BALL_RADIUS
-    return min(rails, sphere)
+    bound: float = norm(sub(pos, carried_point(chain, q, chain.hub))) - chain.hub_reach - BALL_RADIUS
+    normal = (0.0, 0.0, 1.0)
+    parts = chain.capsules
+    frame = world_frame()
+    part = 0
+    for joint in range(-1, chain.slides):
+        if joint >= 0:
+            frame = next_frame(chain, joint, q[joint], frame)
+        while part < parts.shape[0] and parts[part, MOVED_BY] == joint:
+            start, end = point_of(frame, row(parts, part, START)), point_of(frame, row(parts, part, END))
+            bound, normal = _part_gap(pos, start, end, parts[part, RADIUS], bound, normal)
+            part += 1
+    return bound

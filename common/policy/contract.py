@@ -41,6 +41,15 @@ class Contract(BaseModel):
     measures: dict[str, Any] = {}
     made_with: dict[str, str] = {}
 
+    @property
+    def is_end_to_end(self) -> bool:
+        """Whether the policy goes from measurements to actions by itself, as the table of Hu et al. uses the word.
+
+        A policy that is fed a prediction of the trajectory, a filtered ball, or an estimated or true spin is not.
+        """
+        observation = self.task.observation
+        return not observation.is_tracked and observation.spin == "hidden"
+
     def expecting(self, spin: ExpectedSpin | Literal["contract"]) -> Self:
         """Return the contract with another expected spin than in training; ``contract`` returns it as it is."""
         if spin == "contract":

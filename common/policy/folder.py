@@ -133,6 +133,7 @@ def _shape(contract: Contract) -> dict[str, Any]:
         "network": contract.network,
         "control_rate_hz": contract.task.control_rate_hz,
         "robot": contract.task.robot,
+        "rubber": contract.task.rubber,
     }
 
 
@@ -144,7 +145,7 @@ def mean_policy(policies: Sequence[Policy]) -> Policy:
     policies.
 
     Raises:
-        PolicyError: They differ in observation, network, control rate or robot.
+        PolicyError: They differ in observation, network, control rate, robot or rubber.
     """
     first = policies[0].contract
     for policy in policies[1:]:

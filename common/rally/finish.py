@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from common.jit import inlined, kernel
-from common.physics.arm import joints_at, racket_pose
+from common.physics.chain import joints_at, racket_pose
 from common.physics.constants import BALL_RADIUS, GRID_STEP
 from common.physics.fly import RobotPath, fly_step
 from common.physics.touch import NONE
@@ -159,7 +159,7 @@ def pay(
             (1.0 + miss * miss) * (1.0 + miss * miss)
         )
     if not (bounced or hit or landed or state == _TAU_0):
-        reach = _near(norm(sub(pos, racket_pose(joints).centre)))
+        reach = _near(norm(sub(pos, racket_pose(rules.chain, joints).centre)))
         terms[_APPROACH_TERM] = rules.rate_scale * rows[state, _REACH] * reach
         terms[_AIM_TERM] = rules.rate_scale * rows[state, _AIM] * _near(norm(sub(pos, target)))
     terms[_AIM_TERM] += rules.rate_scale * rows[_TAU_23, _AIM] * later_aim + bonus
@@ -220,7 +220,7 @@ def finish_step(
     bonus = _landing_bonus(rallies, b, result, rules)
     later_aim = 0.0
     if rallies.ends_at_hit[b] and result.state == _TAU_23 and result.outcome == 0:
-        no_robot = RobotPath(path[:0], 1.0, 0.0)
+        no_robot = RobotPath(path[:0], 1.0, 0.0, rules.chain)
         result, later_aim = simulate_to_landing(rallies, b, result, rules, no_robot)
     pay(rallies, b, result, later_aim, bonus, motion, path, actions, rules, step)
     state, outcome = end_rally(rallies, b, result, rules)

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.perception.cholesky import factor, substitute
-from common.physics.arm import Joints, point_velocity, racket_motion, racket_pose
+from common.physics.chain import Chain, Joints, RacketPose, point_velocity, racket_state
 from common.physics.constants import BALL_RADIUS, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH, Rubber
 from common.physics.flight import Air
 from common.physics.racket_bounce import racket_bounce
@@ -36,7 +36,8 @@ from common.task.landing_point import SHORT_OF_NET, landing_and_clearance
 from common.task.randomization import RallyParameter, air_of, rubber_of
 
 Array = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
+Limits = npt.NDArray[np.int8]
+Losses = npt.NDArray[np.float32]
 Goals = tuple[float, float, float, float, float, float]
 
 BACK: Final = 12  # control steps that a correction looks back: 0.24 s at 50 Hz, twice the slowest drive's lag
@@ -53,7 +54,9 @@ LEFT_POS, LEFT_VEL, LEFT_SPIN = 28, 31, 34  # the ball as it left the racket
 HIT: Final = 37
 
 # Rows of the drives' table (5, 7)
-INERTIA, STIFFNESS, DAMPING, JOINT_DAMPING, HALF_RANGE = range(5)
+INERTIA, STIFFNESS, DAMPING, HALF_RANGE, BACK_EMF = range(5)
+# What limits a drive in a substep
+FREE, CURRENT, VOLTAGE = range(3)
 
 MARGIN: Final = 0.16  # [m] by which the ball should clear the net
 # [m] targets nearer to the table's edge are moved inside, so that a small miss still returns
@@ -77,12 +80,23 @@ _INSANE: Final = 1e6  # larger results give no correction
 class DriveHistory(NamedTuple):
     """What one robot's drives did before a contact."""
 
-    # (BACK, n, 7) whether a drive was at its force limit, by control step (a ring) and substep
-    limited: Flags
+    # (BACK, n, 7) what limited a drive, by control step (a ring) and substep
+    limits: Limits
+    losses: Losses  # (BACK, n, 7) slope of a joint's losses and its speed, at the same times
     newest: int  # the ring's row of the contact's control step
     steps: int  # control steps that the rally or the ring reaches back, including the contact's
     late: int  # action latency [substeps]
-    drives: Array  # (5, 7) inertia, k_p, k_v, joint damping, half-range of the targets
+    drives: Array  # (5, 7) inertia, k_p, k_v, half-range of the targets, slope of force and speed at the voltage limit
+    h: float  # MuJoCo's time step [s]
+
+
+class DriveHistories(NamedTuple):
+    """What the drives of B robots did: ``DriveHistory`` for all of them."""
+
+    limits: Limits  # (B, BACK, n, 7)
+    losses: Losses  # (B, BACK, n, 7)
+    newest: int  # the rings' row of the newest control step
+    drives: Array  # (5, 7)
     h: float  # MuJoCo's time step [s]
 
 
@@ -115,22 +129,24 @@ def write_departure(hit: Array, pos: Vec, vel: Vec, spin: Vec) -> None:
 
 
 @kernel
-def _approach(q: Joints, qd: Joints, pos: Vec) -> tuple[float, Vec, Vec]:
-    """Return gap [m] and normal between racket and ball, and the racket's velocity at the contact point [m/s]."""
-    pose = racket_pose(q)
+def _approach(chain: Chain, q: Joints, qd: Joints, pos: Vec) -> tuple[float, Vec, Vec, RacketPose]:
+    """Return gap [m] and normal between racket and ball, the contact point's velocity [m/s], and the racket's pose."""
+    pose, racket_vel, racket_spin = racket_state(chain, q, qd)
     gap, normal = racket_gap(pos, pose)
-    racket_vel, racket_spin = racket_motion(q, qd)
     surface_vel = point_velocity(pose.centre, racket_vel, racket_spin, axpy(-BALL_RADIUS, normal, pos))
-    return gap, normal, surface_vel
+    return gap, normal, surface_vel, pose
 
 
 @kernel
-def hit_result(q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, rubber: Rubber, air: Air) -> Goals:
+def hit_result(
+    chain: Chain, q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, rubber: Rubber, air: Air
+) -> Goals:
     """Return the result of a hit: ``GOALS`` numbers.
 
     The racket may be a little away from the ball or inside it. The contact is shifted to the time at which they meet.
 
     Args:
+        chain: Of the robot.
         q: Joint positions near the contact [m, rad].
         qd: Joint velocities [m/s, rad/s].
         pos: Position of the ball then [m].
@@ -143,7 +159,7 @@ def hit_result(q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, rubber: Rub
         Landing x, y [m]; offset from the racket's centre along its side and handle, times ``PLACE_WEIGHT`` [m]; height
         over the net [m]; delay of the contact, times ``PACE`` [m].
     """
-    gap, normal, surface_vel = _approach(q, qd, pos)
+    gap, normal, surface_vel, _ = _approach(chain, q, qd, pos)
     later = -gap / min(dot(sub(vel, surface_vel), normal), _SLOWEST_CLOSING)
     pos = axpy(later, vel, pos)
     q = (
@@ -155,8 +171,7 @@ def hit_result(q: Joints, qd: Joints, pos: Vec, vel: Vec, spin: Vec, rubber: Rub
         q[5] + later * qd[5],
         q[6] + later * qd[6],
     )
-    _, normal, surface_vel = _approach(q, qd, pos)
-    pose = racket_pose(q)
+    _, normal, surface_vel, pose = _approach(chain, q, qd, pos)
     offset = sub(pos, pose.centre)
     vel, spin = racket_bounce(vel, spin, normal, surface_vel, rubber)
     x, y, over_net = landing_and_clearance(pos, vel, spin, air)
@@ -184,10 +199,13 @@ def _joints(hit: Array, at: int) -> Joints:
 
 
 @kernel
-def hit_sensitivity(hit: Array, rubber: Rubber, air: Air, by_pos: Array, by_vel: Array) -> Goals:
+def hit_sensitivity(
+    chain: Chain, hit: Array, rubber: Rubber, air: Air, by_pos: Array, by_vel: Array
+) -> Goals:
     """Write how a hit's result depends on the joints at the contact, and return the result by our contact law.
 
     Args:
+        chain: Of the robot.
         hit: (HIT,).
         rubber: Of the racket.
         air: Of the rally.
@@ -196,10 +214,10 @@ def hit_sensitivity(hit: Array, rubber: Rubber, air: Air, by_pos: Array, by_vel:
     """
     pos, vel, spin = vec_at(hit, BALL_POS), vec_at(hit, BALL_VEL), vec_at(hit, BALL_SPIN)
     q, qd = _joints(hit, JOINT_POS), _joints(hit, JOINT_VEL)
-    result = hit_result(q, qd, pos, vel, spin, rubber, air)
+    result = hit_result(chain, q, qd, pos, vel, spin, rubber, air)
     for joint in range(7):
-        moved = hit_result(_moved(q, joint, _POS_STEP), qd, pos, vel, spin, rubber, air)
-        faster = hit_result(q, _moved(qd, joint, _VEL_STEP), pos, vel, spin, rubber, air)
+        moved = hit_result(chain, _moved(q, joint, _POS_STEP), qd, pos, vel, spin, rubber, air)
+        faster = hit_result(chain, q, _moved(qd, joint, _VEL_STEP), pos, vel, spin, rubber, air)
         for goal in range(GOALS):
             by_pos[goal, joint] = (moved[goal] - result[goal]) / _POS_STEP
             by_vel[goal, joint] = (faster[goal] - result[goal]) / _VEL_STEP
@@ -212,9 +230,10 @@ def back_through_drives(
 ) -> None:
     """Write d result / d action for the control step of a contact and the control steps before it.
 
-    Each joint is a drive of its own: inertia v' = k_p (target - q) - (k_v + d) v, in the steps of MuJoCo's implicit
-    integrator. A drive at its force limit does not depend on its target. The adjoint recursion runs back from the
-    contact.
+    Each joint is a drive of its own: inertia v' = k_p (target - q) - (k_v + d) v, where d is the slope of its losses,
+    in the steps of MuJoCo's implicit integrator. The force of a drive at a limit does not depend on its target: at the
+    limit of the current it is constant, at that of the voltage it falls with the speed. The adjoint recursion runs back
+    from the contact.
 
     Args:
         by_pos: (7,) d result / d joint position at the contact.
@@ -223,15 +242,11 @@ def back_through_drives(
         history: Of the robot's drives.
         out: (BACK, 7) by control step, the contact's first; written.
     """
-    limited, newest, steps, late, drives, h = history
-    substeps = limited.shape[1]
+    limits, losses, newest, steps, late, drives, h = history
+    substeps = limits.shape[1]
     row = min(int(moment / h), substeps - 1)
     for j in range(7):
         inertia, stiffness, damping = drives[INERTIA, j], drives[STIFFNESS, j], drives[DAMPING, j]
-        slowed, driven = (
-            inertia + h * drives[JOINT_DAMPING, j],
-            inertia + h * (drives[JOINT_DAMPING, j] + damping),
-        )
         for k in range(out.shape[0]):
             out[k, j] = 0.0
         # Positions between substeps are linear: q(moment) = q_row + (moment - row h) v_{row + 1}
@@ -240,9 +255,14 @@ def back_through_drives(
             for s in range(row if k == 0 else substeps - 1, -1, -1):
                 if k > 0 or s < row:
                     on_v += h * on_q  # q+ = q + h v+
-                if limited[(newest - k) % limited.shape[0], s, j]:
-                    on_v *= inertia / slowed
+                at = (newest - k) % limits.shape[0]
+                slowed = inertia + h * losses[at, s, j]
+                if limits[at, s, j] != FREE:
+                    on_v *= inertia / (
+                        slowed + (h * drives[BACK_EMF, j] if limits[at, s, j] == VOLTAGE else 0.0)
+                    )
                     continue
+                driven = slowed + h * damping
                 pull = h * stiffness / driven * on_v
                 age = k + (late - s + substeps - 1) // substeps if s < late else k
                 if age < steps:  # an earlier target belongs to the previous rally
@@ -293,12 +313,15 @@ def least_change(sensitivity: Array, wanted: Array, out: Array) -> bool:
 
 
 @kernel
-def correction(hit: Array, parameters: Array, model: int, history: DriveHistory, out: Array) -> bool:
+def correction(
+    chain: Chain, hit: Array, parameters: Array, model: int, history: DriveHistory, out: Array
+) -> bool:
     """Write the least change of the last actions that gives the wanted hit in the linear model.
 
     Args:
+        chain: Of the robot.
         hit: (HIT,) ball and joints at the contact, and the ball as it left.
-        parameters: ``randomization.RallyParameter`` of the rally (14,).
+        parameters: ``randomization.RallyParameter`` of the rally (15,).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
         history: Of the robot's drives.
         out: (BACK, 7) [half-range] by control step, the contact's first; written.
@@ -308,7 +331,7 @@ def correction(hit: Array, parameters: Array, model: int, history: DriveHistory,
     """
     air = air_of(parameters, model)
     by_pos, by_vel = np.empty((GOALS, 7)), np.empty((GOALS, 7))
-    result = hit_sensitivity(hit, rubber_of(parameters), air, by_pos, by_vel)
+    result = hit_sensitivity(chain, hit, rubber_of(parameters), air, by_pos, by_vel)
     sensitivity = np.empty((GOALS, out.shape[0], 7))
     for goal in range(GOALS):
         back_through_drives(by_pos[goal], by_vel[goal], hit[MOMENT], history, sensitivity[goal])
@@ -336,35 +359,32 @@ def correction(hit: Array, parameters: Array, model: int, history: DriveHistory,
 
 @kernel
 def corrections(
+    chain: Chain,
     hits: Array,
     parameters: Array,
     model: int,
-    limited: Flags,
-    newest: int,
-    drives: Array,
-    h: float,
+    histories: DriveHistories,
     out: Array,
     steps: npt.NDArray[np.int64],
 ) -> None:
     """Correct every fresh hit of B robots.
 
     Args:
+        chain: Of the robots.
         hits: (B, HIT).
-        parameters: ``randomization.RallyParameter`` of the rallies (B, 14).
+        parameters: ``randomization.RallyParameter`` of the rallies (B, 15).
         model: ``flight.SIMPLE`` or ``flight.FULL``.
-        limited: (B, BACK, n, 7) as ``DriveHistory.limited``.
-        newest: The ring's row of the newest control step.
-        drives: (5, 7).
-        h: MuJoCo's time step [s].
+        histories: Of the robots' drives.
         out: (B, BACK, 7); rows of fresh hits are written.
         steps: (B,) how many control steps back a correction reaches; 0: there is none; written.
     """
+    limits, losses, newest, drives, h = histories
     for b in range(hits.shape[0]):
         steps[b] = 0
         if hits[b, FRESH] == 0.0:
             continue
         reach = min(int(hits[b, STEP]) + 1, BACK)
         late = int(parameters[b, RallyParameter.ACTION_LATENCY] / h + 0.5)
-        history = DriveHistory(limited[b], newest, reach, late, drives, h)
-        if correction(hits[b], parameters[b], model, history, out[b]):
+        history = DriveHistory(limits[b], losses[b], newest, reach, late, drives, h)
+        if correction(chain, hits[b], parameters[b], model, history, out[b]):
             steps[b] = reach

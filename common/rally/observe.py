@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.perception.flight_track import PREDICTED, PRESENT, SPIN
-from common.physics.arm import racket_motion, racket_pose, racket_quaternion
+from common.physics.chain import Chain, quaternion_of, racket_state
 from common.physics.constants import GRID_STEP
 from common.rally.state import STAMP, Array, Integers, Rallies
 from common.task.observation import ObservationConfig
@@ -46,6 +46,7 @@ def observe(
     rows: Integers,
     joint_pos: Array,
     joint_vel: Array,
+    chain: Chain,
     flags: ObservationFlags,
     out: npt.NDArray[np.float32],
 ) -> None:
@@ -56,6 +57,7 @@ def observe(
         rows: Rows to read and write.
         joint_pos: Joint positions now (B, 7) [m, rad].
         joint_vel: Joint velocities now (B, 7) [m/s, rad/s].
+        chain: Of the robot.
         flags: Which parts the layout has.
         out: The observations.
     """
@@ -64,9 +66,8 @@ def observe(
         o, q, qd = out[b], joint_pos[b], joint_vel[b]
         joints = (q[0], q[1], q[2], q[3], q[4], q[5], q[6])
         rates = (qd[0], qd[1], qd[2], qd[3], qd[4], qd[5], qd[6])
-        centre = racket_pose(joints).centre
-        velocity, _ = racket_motion(joints, rates)
-        quaternion = racket_quaternion(joints)
+        pose, velocity, _ = racket_state(chain, joints, rates)
+        centre, quaternion = pose.centre, quaternion_of(pose)
         for j in range(7):
             o[j], o[7 + j] = q[j], qd[j]
         for j in range(3):

@@ -1,7 +1,7 @@
 """The observation of a real robot: what a policy observes, from what the robot measures, without a simulator.
 
 ```python
-observer = Observer(policy.contract.task.observation)
+observer = Observer(policy.contract.task.observation, chain)
 observer.begin(target)  # for each ball
 while playing:  # at the policy's control rate
     obs = observer.observe(now, joint_pos, joint_vel, ball)
@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.perception.flight_track import new_tracks
+from common.physics.chain import Chain
 from common.rally.observe import observation_flags, observe
 from common.rally.sensing import update_flight_filter
 from common.rally.state import allocate
@@ -40,6 +41,7 @@ class Observer:
 
     Args:
         options: What the policy observes: ``contract.task.observation``.
+        chain: Of the robot.
         position_noise: Standard deviation of a sample's position per axis [m]; default: as in training.
         velocity_noise: Standard deviation of its velocity per axis [m/s].
 
@@ -50,6 +52,7 @@ class Observer:
     def __init__(
         self,
         options: ObservationConfig,
+        chain: Chain,
         position_noise: float = PROFILES["standard"].position_noise,
         velocity_noise: float = PROFILES["standard"].velocity_noise,
     ) -> None:
@@ -57,7 +60,7 @@ class Observer:
             raise ValueError(
                 "spin 'true' can't be measured; allowed: a policy with spin 'estimated' or 'hidden'"
             )
-        self._options = options
+        self._options, self._chain = options, chain
         self._noise = position_noise, velocity_noise
         self._rally, _ = allocate(1, options.history, tracks=new_tracks(1, options.expected_spin))
         self._flags = observation_flags(options)._replace(is_privileged=False)
@@ -79,7 +82,7 @@ class Observer:
 
         Args:
             now: Time now on the clock of ``ball.moment`` [s].
-            joint_pos: (7,) in the order of ``observation.JOINT_RANGES`` [m, rad].
+            joint_pos: (7,) from the robot's base to its racket [m, rad].
             joint_vel: (7,) [m/s, rad/s].
             ball: The newest sample; if there is no new one, the last sample again.
         """
@@ -101,6 +104,7 @@ class Observer:
             np.zeros(1, np.int64),
             np.array(joint_pos, np.float64).reshape(1, 7),
             np.array(joint_vel, np.float64).reshape(1, 7),
+            self._chain,
             self._flags,
             obs,
         )

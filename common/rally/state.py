@@ -8,6 +8,7 @@ import numpy.typing as npt
 from common.perception.camera import DETECTION_BUFFER
 from common.perception.camera_filter import ESTIMATE
 from common.perception.flight_track import new_tracks
+from common.physics.chain import Chain
 from common.physics.vec import Vec
 from common.rally.hit_correction import HIT
 from common.task.randomization import MAX_LATENCY_STEPS, RALLY_PARAMETERS
@@ -30,7 +31,7 @@ class Rallies(NamedTuple):
     ball: Array  # (B, 9) position [m], velocity [m/s], spin [rad/s]
     state: Integers  # (B,) states.State
     seed: npt.NDArray[np.uint64]  # (B,)
-    parameters: Array  # (B, 14) randomization.RallyParameter
+    parameters: Array  # (B, 15) randomization.RallyParameter
     clock: Integers  # (B,) grid steps since launch
     rounds_left: Integers  # (B,) rallies left in this episode, with the one in play
     landing_bonus_paid: Flags  # (B,) the bonus for the predicted landing point is paid once a rally
@@ -79,6 +80,7 @@ class Rules(NamedTuple):
     grid_steps: int  # in a control step
     time_limit: float  # [s] of a rally
     flight_model: int  # ``flight.SIMPLE`` or ``flight.FULL``
+    chain: Chain  # of the robot
 
 
 class Step(NamedTuple):

@@ -12,14 +12,7 @@ import numpy.typing as npt
 
 from common.jit import inlined, kernel
 from common.perception.camera import DETECTION_BUFFER, begin_detections
-from common.physics.arm import (
-    joint_rates_at,
-    joints_at,
-    point_velocity,
-    racket_motion,
-    racket_pose,
-    speed_bound,
-)
+from common.physics.chain import joint_rates_at, joints_at, point_velocity, racket_state, speed_bound
 from common.physics.constants import BALL_MASS, BALL_RADIUS, GRID_STEP
 from common.physics.fly import RobotPath, Segment, fly_step
 from common.physics.racket_bounce import racket_bounce
@@ -151,8 +144,8 @@ def _hit_ball(
     pos, vel, spin = ball
     joints = joints_at(robot.joints, moment, robot.step)
     rates = joint_rates_at(robot.joints, moment, robot.step)
-    centre = racket_pose(joints).centre
-    racket_vel, racket_spin = racket_motion(joints, rates)
+    pose, racket_vel, racket_spin = racket_state(rules.chain, joints, rates)
+    centre = pose.centre
     contact = axpy(-BALL_RADIUS, normal, pos)
     surface_vel = point_velocity(centre, racket_vel, racket_spin, contact)
     if dot(sub(vel, surface_vel), normal) >= 0.0:
@@ -254,7 +247,7 @@ def play_step(
     path = np.empty((motion.joint_pos.shape[1] + 1, 7))
     for b in range(rallies.state.shape[0]):
         copy_path(motion, b, path)
-        robot = RobotPath(path, motion.step, speed_bound(path, motion.step))
+        robot = RobotPath(path, motion.step, speed_bound(rules.chain, path, motion.step), rules.chain)
         result = _fly_one(rallies, b, robot, rules, profile, step)
         finish_step(rallies, b, result, motion, actions, rules, profile, path, step)
 

@@ -1,7 +1,8 @@
-"""Settings of a program from flags, environment, a TOML file and defaults, in this order of precedence.
+"""Settings of a program from flags, environment, a TOML file, a recipe and defaults, in this order of precedence.
 
 * File (``--config``, or ``TOPSPIN_CONFIG``): shared settings at the top (``run = "night"``), one table for each of
   task, experience and network (``[task]``, ``[experience]``, ``[network]``), and one table per program (``[learner]``).
+* Recipe (setting ``recipe``, where a program has it): a named file of the same form that comes with the project.
 * Flags: ``--max-lag 1``, ``--ppo.clip 0.2``, ``--task.launch strong``; a list is ``a,b``.
 * Environment: ``TOPSPIN_LEARNER__PPO__CLIP=0.2``; a table that several programs read has its own name there:
   ``TOPSPIN_TASK__LAUNCH=strong``; a shared setting needs no table: ``TOPSPIN_RUN=night``.
@@ -113,6 +114,7 @@ def load(
     section: str,
     environ: Mapping[str, str] | None = None,
     recorded: Path | None = None,
+    recipes: Path | None = None,
 ) -> _Model:
     """Return the settings of one program.
 
@@ -124,6 +126,7 @@ def load(
         environ: Environment; the process's by default.
         recorded: File with the settings of a resumed run; ``--config`` takes its place, but the environment's
             ``TOPSPIN_CONFIG`` does not.
+        recipes: Folder of the recipes that have a name; None: setting ``recipe`` is not followed.
 
     Raises:
         ConfigError: An unknown or unusable setting.
@@ -131,7 +134,24 @@ def load(
     """
     program = _Program(model, settings_of(model), prog, section)
     layers = _read(program, argv, environ, recorded)
+    recipe = next((layer.values["recipe"] for layer in layers if "recipe" in layer.values), "")
+    if recipes is not None and recipe:
+        layers = (*layers, _read_file(str(recipe_file(recipe, recipes)), program))
     return _merged(model, (*layers, _nested_defaults(program.settings)), program)
+
+
+def recipe_names(folder: Path) -> list[str]:
+    """Return the names of the recipes in a folder."""
+    return sorted(path.stem for path in folder.glob("*.toml"))
+
+
+def recipe_file(given: str, folder: Path) -> Path:
+    """Return the file of a recipe, given by its name in ``folder`` or as a file. Raises ConfigError."""
+    names = recipe_names(folder)
+    file = folder / f"{given}.toml" if given in names else Path(given)
+    if not file.is_file():
+        raise ConfigError(f"no recipe {given!r}; allowed: {', '.join(names)}, or a TOML file")
+    return file
 
 
 def first_look(
@@ -222,7 +242,7 @@ def _nested_defaults(settings: Mapping[str, Setting]) -> _Layer:
 
 def _read(
     program: _Program, argv: Sequence[str], environ: Mapping[str, str] | None, recorded: Path | None
-) -> tuple[_Layer, _Layer, _Layer]:
+) -> tuple[_Layer, ...]:
     """Return the values from flags, environment and file."""
     environ = os.environ if environ is None else environ
     flags, file = _read_flags(argv, program)

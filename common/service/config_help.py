@@ -8,6 +8,7 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -26,6 +27,7 @@ _TYPE_WORDS: Final = {
 
 
 _TEXT_COLUMN: Final = 26
+_MOST_DIGITS: Final = 19  # of a setting: none is above 2^63
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,13 +53,25 @@ class Setting:
         if typing.get_origin(self.kind) is Literal:
             return next((choice for choice in typing.get_args(self.kind) if str(choice) == text), text)
         if not _is_list(self.kind):
-            return text
+            return _whole(text) if self.kind is int else text
         if text.startswith("["):
             try:
                 return json.loads(text)
             except ValueError:
                 return text
         return [item.strip() for item in text.split(",") if item.strip()]
+
+
+def _whole(text: str) -> str:
+    """Return a whole number that is written with an exponent, such as 60e6, without it; other text as it is."""
+    try:
+        number = Decimal(text) if "e" in text.lower() else Decimal("nan")
+    except InvalidOperation:
+        return text
+    is_short = (
+        number.is_finite() and number.adjusted() < _MOST_DIGITS
+    )  # 1e999999999 would be a gigabyte of zeros
+    return f"{number:f}" if is_short and number == number.to_integral_value() else text
 
 
 def settings_of(model: type[BaseModel], parent: str = "") -> dict[str, Setting]:
@@ -109,10 +123,12 @@ def format_help(
     lines += _entry("--config FILE", "TOML file of settings", width)
     if len(shown) < len(settings):
         lines += _entry("--help-all", f"all {len(settings)} settings", width)
+    recipe = "which beats the recipe, " if "recipe" in settings else ""
     lines += [
         "",
         *textwrap.wrap(
-            f"Flags beat the environment ({variable}), which beats the file, which beats the defaults.", width
+            f"Flags beat the environment ({variable}), which beats the file, {recipe}which beats the defaults.",
+            width,
         ),
     ]
     return "\n".join(lines) + "\n"

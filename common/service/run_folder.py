@@ -97,6 +97,11 @@ class RunFolder:
         """The evaluator's curve: one row an evaluation."""
         return self.report / "evaluations.csv"
 
+    @property
+    def final(self) -> Path:
+        """The one line of a run that ended: its summary, with the measures of its last policy."""
+        return self.report / "final.json"
+
     def create(self) -> None:
         """Make the folders."""
         for path in (self.tensorboard, self.checkpoints, self.latest_policy.parent, self.logs, self.report):

@@ -1,8 +1,8 @@
 """The task's settings, said once. A policy's contract holds them, and a hash of them keeps learner and actors alike."""
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.physics.constants import GRID_STEP
 from common.physics.flight import Flight
@@ -10,7 +10,8 @@ from common.task.launch_presets import PresetName
 from common.task.observation import ObservationConfig
 from common.task.reward import RewardConfig
 
-RobotName = Literal["rails", "usst"]
+RobotName = Literal["rails", "usst", "pro", "arm"]  # the folders of common/robot/robots
+RubberName = Literal["inverted", "short_pips", "medium_pips", "long_pips", "long_pips_ox", "anti_spin"]
 FlightName = Literal["simple", "full"]
 Randomization = Literal["off", "standard", "hard"]
 Perception = Literal["cheap", "full"]
@@ -61,7 +62,13 @@ class TaskConfig(MatchConditions):
 
     robot: RobotName = Field(
         "rails",
-        description="rails: our robot; usst: the same with the published joint speeds of the authors' robot",
+        description="rails: two rails and five joints; usst: the same with the published joint speeds of the authors' "
+        "robot; pro: the same with much stronger drives; arm: a seven-joint arm on a fixed base",
+    )
+    rubber: RubberName = Field(
+        "inverted",
+        description="covering of the racket, a published one; the randomization's ranges are scaled to it; only with "
+        "collision tailored",
     )
     control_rate_hz: Literal[25, 50, 100, 200] = Field(
         50, description="control steps a second", json_schema_extra={"unit": "Hz"}
@@ -82,6 +89,15 @@ class TaskConfig(MatchConditions):
     )
     reward: RewardConfig = RewardConfig()
     observation: ObservationConfig = ObservationConfig()
+
+    @model_validator(mode="after")
+    def _contacts_know_the_rubber(self) -> Self:
+        if self.collision == "original" and self.rubber != "inverted":
+            raise ValueError(
+                f"rubber {self.rubber} with collision original; MuJoCo's own contacts know no rubber, "
+                "allowed: collision tailored"
+            )
+        return self
 
     @property
     def flight_model(self) -> Flight:

@@ -32,23 +32,6 @@ class TeacherConfig(BaseModel):
         description="share of the way to the court's middle by which the teacher's targets are moved: a student that "
         "observes less has larger errors and should aim farther inside",
     )
-    arm_memory: bool = Field(
-        False,
-        description="use the arm as memory: until the stroke, wrist and roll hold the first measurements of the ball's "
-        "height and sideways velocity; a network without memory reads the spin from them",
-    )
-    bptt: bool = Field(
-        False,
-        description="backpropagation through time: also train actions whose effect the policy observes later in its "
-        "joints, with gradients through kinematics and drives",
-    )
-    max_log_std: float = Field(
-        1.0,
-        ge=-10,
-        le=1,
-        description="upper bound of the actions' log standard deviation while the teacher teaches: action noise erases "
-        "what the arm holds",
-    )
 
     def teaches(self, version: int) -> bool:
         """Return whether the policy of this version, one an epoch, still imitates the teacher."""

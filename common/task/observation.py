@@ -19,7 +19,7 @@ class Part(NamedTuple):
 
 
 OBSERVATION: tuple[Part, ...] = (
-    Part("joint_pos", 7, "m, rad", -3.2, 3.2, "positions of rail_x, rail_y, yaw, pitch, elbow, wrist, roll"),
+    Part("joint_pos", 7, "m, rad", -3.2, 3.2, "positions of the robot's joints, from its base to the racket"),
     Part("joint_vel", 7, "m/s, rad/s", -60.0, 60.0, "velocities of the same joints"),
     Part("racket_pos", 3, "m", -3.0, 2.0, "position of the racket's centre"),
     Part(
@@ -30,7 +30,7 @@ OBSERVATION: tuple[Part, ...] = (
         1.0,
         "quaternion (w, x, y, z) of the racket, w >= 0; near (1, 0, 0, 0) at home",
     ),
-    Part("racket_vel", 3, "m/s", -15.0, 15.0, "velocity of the racket's centre"),
+    Part("racket_vel", 3, "m/s", -30.0, 30.0, "velocity of the racket's centre"),
     Part(
         "ball_pos",
         3,
@@ -115,18 +115,6 @@ ACTION: tuple[Part, ...] = (
         "joint_target", 7, "half-range", -1.0, 1.0, "absolute target of each joint: middle + a x half-range"
     ),
 )
-
-JOINT_RANGES: Final = (
-    # name, unit, half-range: targets reach from -half-range to half-range; home
-    ("rail_x", "m", 0.75, 0.0),
-    ("rail_y", "m", 0.90, 0.0),
-    ("yaw", "rad", 2.9, 0.0),
-    ("pitch", "rad", 1.75, 1.0),
-    ("elbow", "rad", 2.4, 1.0),
-    ("wrist", "rad", 2.1, 1.1),
-    ("roll", "rad", 2.9, 0.0),
-)
-"""The robot's joints in the order of observation and action. ``common/env/robot.xml`` has the same numbers."""
 
 
 def size(layout: tuple[Part, ...]) -> int:

@@ -4,7 +4,6 @@ from common.task.observation import (
     ACTION,
     AGE,
     EARLIER,
-    JOINT_RANGES,
     OBSERVATION,
     PREDICTION,
     PRIVILEGED,
@@ -71,12 +70,6 @@ def markdown() -> str:
             lines.append(f"| {_index(where)} | {name} | {part.unit} | {numbers} | {part.meaning} |")
     lines += [
         "",
-        "Targets beyond -1 to 1 are clipped. `common/env/robot.xml` has gains and force limits.",
-        "",
-        "| joint | half-range | home |",
-        "|---|---|---|",
-    ]
-    lines += [
-        f"| {name} | {half_range:g} {unit} | {home:g} |" for name, unit, half_range, home in JOINT_RANGES
+        "Targets beyond -1 to 1 are clipped. [Robots](robots.md) has the joints' ranges, limits and gains.",
     ]
     return "\n".join(lines) + "\n"

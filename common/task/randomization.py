@@ -7,7 +7,14 @@ import numpy as np
 import numpy.typing as npt
 
 from common.jit import kernel
-from common.physics.constants import GRID_STEP, INVERTED, TABLE_FRICTION, TABLE_RESTITUTION0, Rubber
+from common.physics.constants import (
+    GRID_STEP,
+    INVERTED,
+    RUBBERS,
+    TABLE_FRICTION,
+    TABLE_RESTITUTION0,
+    Rubber,
+)
 from common.physics.flight import Air
 from common.task.counter_rng import Stream, between, uniform
 
@@ -28,6 +35,8 @@ class RandomizationProfile(NamedTuple):
     racket_restitution_slope: Range  # [s/m]
     racket_alpha: Range  # [-]
     racket_spin_loss: Range  # [-]
+    racket_friction: float  # [-] of the rubber; inf: it never slides
+    racket_friction_factor: Range  # [-] multiplies it
     gain_factor: Range  # [-] one number each for kp, kv and damping of each joint
     observation_latency: Range  # [s] of the ball's samples
     action_latency: Range  # [s]
@@ -54,6 +63,8 @@ PROFILES: dict[str, RandomizationProfile] = {
         racket_restitution_slope=(INVERTED.restitution_slope, INVERTED.restitution_slope),
         racket_alpha=(INVERTED.alpha, INVERTED.alpha),
         racket_spin_loss=(INVERTED.spin_loss, INVERTED.spin_loss),
+        racket_friction=INVERTED.friction,
+        racket_friction_factor=(1.0, 1.0),
         gain_factor=(1.0, 1.0),
         observation_latency=(0.0, 0.0),
         action_latency=(0.0, 0.0),
@@ -77,6 +88,8 @@ PROFILES: dict[str, RandomizationProfile] = {
         racket_restitution_slope=(0.015, 0.023),
         racket_alpha=(0.64, 0.76),
         racket_spin_loss=(0.0, 0.25),
+        racket_friction=INVERTED.friction,
+        racket_friction_factor=(0.8, 1.2),
         gain_factor=(0.9, 1.1),
         observation_latency=(0.010, 0.040),
         action_latency=(0.0, 0.010),
@@ -100,6 +113,8 @@ PROFILES: dict[str, RandomizationProfile] = {
         racket_restitution_slope=(0.012, 0.026),
         racket_alpha=(0.58, 0.80),
         racket_spin_loss=(0.0, 0.35),
+        racket_friction=INVERTED.friction,
+        racket_friction_factor=(0.6, 1.4),
         gain_factor=(0.8, 1.2),
         observation_latency=(0.020, 0.040),
         action_latency=(0.0, 0.020),
@@ -115,7 +130,35 @@ PROFILES: dict[str, RandomizationProfile] = {
         outlier_size=0.5,
     ),
 }
-"""Profiles by name. Training and every headline figure use ``standard``."""
+"""Profiles by name, for inverted rubber. Training and every headline figure use ``standard``."""
+
+
+def profile_of(name: str, rubber: str = "inverted") -> RandomizationProfile:
+    """Return the profile for a racket with this rubber.
+
+    Each range of the racket is scaled by the ratio of the rubber's published value to that of inverted rubber: it is as
+    wide in percent, and never negative. The friction is the rubber's own, and its factor varies as the table's
+    friction does.
+
+    Args:
+        name: Key of ``PROFILES``.
+        rubber: Key of ``constants.RUBBERS``.
+    """
+    profile, covering = PROFILES[name], RUBBERS[rubber]
+
+    def scaled(limits: Range, value: float, inverted: float) -> Range:
+        ratio = value / inverted  # exactly 1 for inverted rubber, whose ranges keep their bits
+        return limits[0] * ratio, limits[1] * ratio
+
+    return profile._replace(
+        racket_restitution0=scaled(profile.racket_restitution0, covering.restitution0, INVERTED.restitution0),
+        racket_restitution_slope=scaled(
+            profile.racket_restitution_slope, covering.restitution_slope, INVERTED.restitution_slope
+        ),
+        racket_alpha=scaled(profile.racket_alpha, covering.alpha, INVERTED.alpha),
+        racket_spin_loss=scaled(profile.racket_spin_loss, covering.spin_loss, INVERTED.spin_loss),
+        racket_friction=covering.friction,
+    )
 
 
 class RallyParameter(IntEnum):
@@ -135,6 +178,7 @@ class RallyParameter(IntEnum):
     ACTION_LATENCY = 11  # [s]
     BURST_START = 12  # [s] since launch
     BURST_END = 13  # [s]
+    RACKET_FRICTION = 14  # inf: the rubber never slides
 
 
 RALLY_PARAMETERS = len(RallyParameter)
@@ -149,19 +193,19 @@ _LATENCY, _BURST = int(Stream.LATENCY), int(Stream.BURST)
 
 @kernel
 def air_of(parameters: Array, model: int) -> Air:
-    """Return the air of a rally with these parameters (14,). ``model`` is ``flight.SIMPLE`` or ``flight.FULL``."""
+    """Return the air of a rally with these parameters (15,). ``model`` is ``flight.SIMPLE`` or ``flight.FULL``."""
     return Air(parameters[_P.DRAG], parameters[_P.LIFT], model)
 
 
 @kernel
 def rubber_of(parameters: Array) -> Rubber:
-    """Return the racket's rubber in a rally with these parameters (14,)."""
+    """Return the racket's rubber in a rally with these parameters (15,)."""
     return Rubber(
         parameters[_P.RACKET_RESTITUTION0],
         parameters[_P.RACKET_SLOPE],
         parameters[_P.RACKET_ALPHA],
         parameters[_P.RACKET_SPIN_LOSS],
-        np.inf,
+        parameters[_P.RACKET_FRICTION],
     )
 
 
@@ -169,7 +213,7 @@ def rubber_of(parameters: Array) -> Rubber:
 def draw_parameters(
     seed: int, drag_factor: float, lift_factor: float, profile: RandomizationProfile, out: Array
 ) -> None:
-    """Write a rally's parameters into ``out`` (14,): a pure function of its seed.
+    """Write a rally's parameters into ``out`` (15,): a pure function of its seed.
 
     Target, table and racket have no effect on whether the launch is valid. So they are drawn here and are not sent.
     """
@@ -185,6 +229,8 @@ def draw_parameters(
     )
     out[_P.RACKET_ALPHA] = between(p.racket_alpha[0], p.racket_alpha[1], seed, _RACKET, 2)
     out[_P.RACKET_SPIN_LOSS] = between(p.racket_spin_loss[0], p.racket_spin_loss[1], seed, _RACKET, 3)
+    factor = between(p.racket_friction_factor[0], p.racket_friction_factor[1], seed, _RACKET, 4)
+    out[_P.RACKET_FRICTION] = p.racket_friction * factor
     out[_P.TARGET_X] = between(TARGET_X_RANGE[0], TARGET_X_RANGE[1], seed, _TARGET, 0)
     out[_P.TARGET_Y] = between(TARGET_Y_RANGE[0], TARGET_Y_RANGE[1], seed, _TARGET, 1)
     late = between(p.observation_latency[0], p.observation_latency[1], seed, _LATENCY, 0)

@@ -1,4 +1,4 @@
-"""The paper's reward: R, one literal table, and the penalty e_r.
+"""The reward: the paper's matrix R, one literal table, and the penalty e_r.
 
     reward = one-hot(tau) R[stage] - e_r
 
@@ -59,7 +59,11 @@ class RewardConfig(BaseModel):
         0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"}
     )
     collision: float = Field(
-        0.1, ge=0, le=10, description="e: weight of sum min(F_c/50 N, 1)", json_schema_extra={"unit": "-"}
+        2.0,
+        ge=0,
+        le=100,
+        description="e: weight of sum min(F_c/50 N, 1) over the links: contacts with table, floor, net, robot",
+        json_schema_extra={"unit": "-"},
     )
     landing_scale: float = Field(
         0.5,
@@ -81,8 +85,8 @@ class RewardConfig(BaseModel):
     )
 
 
-PAPER_REWARD = RewardConfig(landing_scale=1.0, landing_bonus=0.0)
-"""The reward as in the paper: R and e_r, without landing bonus."""
+PAPER_REWARD = RewardConfig(reference_rate_hz=200.0, collision=0.1, landing_scale=1.0, landing_bonus=0.0)
+"""The paper's reward at its 200 Hz: R as printed and e_r, without landing bonus. The default differs in all four."""
 
 
 def reward_table() -> npt.NDArray[np.float64]:

@@ -110,7 +110,7 @@ class Player:
             actions[t] = action.numpy()
             acted = self._clock()
             if teacher:
-                corrections[t] = teacher.advice(self.env, self._obs) - actions[t]
+                corrections[t] = teacher.advice(self.env) - actions[t]
             step = self.env.step(actions[t])
             self._obs = step.obs
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated

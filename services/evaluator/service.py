@@ -95,7 +95,7 @@ class EvaluatorService:
         self._member.answer_control()
         now = self._clock()
         if self._asked is None and now >= self._next_play:
-            # The running mean of the weights: no actor plays it, so it is requested and not broadcast.
+            # Usually the running mean of the weights: no actor plays it, so it is requested and not broadcast.
             self._asked = self._transport.request(self._member.keys.policy(), AVERAGE, ANSWER_S, Flow.POLICY)
         answer = self._asked.poll() if self._asked else None
         if answer is not None:

@@ -11,7 +11,7 @@ from common.comms.messages import AVERAGE, PolicySnapshot, StageChange, StageLog
 from common.comms.transport import Flow, Transport
 from common.policy.actor_critic import ActorCritic
 from common.policy.weights import pack
-from services.learner.training import Training
+from services.learner.training import EvaluatedWeights, Training
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +37,7 @@ class Broadcast:
         training: Holds network, moments and progress.
         identity: Fields of every message.
         stages: Stage changes of earlier lives.
+        evaluated: Which weights the evaluator gets.
     """
 
     def __init__(
@@ -46,7 +47,9 @@ class Broadcast:
         training: Training,
         identity: Identity,
         stages: Sequence[StageChange] = (),
+        evaluated: EvaluatedWeights = "mean",
     ) -> None:
+        self._evaluated: EvaluatedWeights = evaluated
         self._transport, self._keys, self._training, self._identity = transport, keys, training, identity
         self.stages = list(stages)
         self._blob = self._average = b""
@@ -90,9 +93,9 @@ class Broadcast:
             request.reply(encode(StageLog(tuple(self.stages))))
 
     def _averaged(self) -> bytes:
-        """Return the newest version with the running mean of the weights."""
+        """Return the newest version with the weights that are evaluated."""
         if not self._average:
-            self._average = self._snapshot(self._training.average)
+            self._average = self._snapshot(self._training.weights(self._evaluated))
         return self._average
 
     def _snapshot(self, network: ActorCritic) -> bytes:

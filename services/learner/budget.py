@@ -35,7 +35,7 @@ class BudgetConfig(BaseModel):
 class Budget:
     """The limits that end a run."""
 
-    datasets: int  # of the whole curriculum
+    datasets: int | None  # of the whole curriculum; None: no limit
     frames: int  # 0: no limit
     minutes: float  # since the first trained batch; 0: no limit
 
@@ -49,7 +49,7 @@ class Budget:
             slack_s: The minutes count as reached this long before their end [s].
         """
         limits = (
-            ("datasets", datasets, self.datasets, 0.0),
+            ("datasets", datasets, math.inf if self.datasets is None else self.datasets, 0.0),
             ("frames", frames, self.frames or math.inf, 0.0),
             ("minutes", seconds / 60.0, self.minutes or math.inf, slack_s / 60.0),
         )

@@ -13,6 +13,7 @@ from services.learner.curriculum import CurriculumConfig
 from services.learner.divergence import DivergenceConfig
 from services.learner.intake import IntakeConfig
 from services.learner.ppo import PPOConfig
+from services.learner.training import EvaluatedWeights
 
 
 class LearnerOptions(BaseModel):
@@ -24,6 +25,11 @@ class LearnerOptions(BaseModel):
     curriculum: CurriculumConfig = CurriculumConfig()
     divergence: DivergenceConfig = DivergenceConfig()
     intake: IntakeConfig = IntakeConfig()
+    evaluated_weights: EvaluatedWeights = Field(
+        "mean",
+        description="which weights are evaluated and saved as a policy: mean: their running mean over about 100 "
+        "datasets; newest: those of the last update, which actors play",
+    )
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}
     )
@@ -58,9 +64,10 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
     )
 
     @model_validator(mode="after")
-    def _a_teacher_has_weight(self) -> Self:
+    def _settings_fit_each_other(self) -> Self:
         if self.experience.teacher.policy and self.ppo.correction_weight == 0:
             raise ValueError(
                 "ppo.correction_weight 0 with experience.teacher.policy; allowed: above 0 (a teacher needs it)"
             )
+        self.curriculum.check_budget(self.frames)
         return self

@@ -5,17 +5,28 @@ III-C). Weights carry over. At a stage change the observation normaliser's count
 reward matrix R applies.
 """
 
-from pydantic import BaseModel, ConfigDict, Field
+import math
+from dataclasses import dataclass
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+LAST_STAGE = 3
 
 
 class CurriculumConfig(BaseModel):
-    """Lengths of the stages in epochs; an epoch is one dataset and its updates."""
+    """Lengths of the stages, in epochs (one dataset and its updates) or in shares of the run's frames."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     stage_1: int = Field(244, ge=0, description="epochs of stage 1, catching (2 M frames of 8,192 an epoch)")
     stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (1 M frames)")
     stage_3: int = Field(14282, ge=0, description="epochs of stage 3, aiming (117 M frames)")
+    stage_shares: tuple[float, ...] = Field(
+        (),
+        description="three shares of the frames of the run (--frames) for stages 1, 2 and 3, in place of their epochs; "
+        "empty: the epochs count",
+    )
     first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
     catch_gate: float = Field(
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
@@ -27,40 +38,116 @@ class CurriculumConfig(BaseModel):
         description="log of the action noise is at most this as stage 3 begins: hit corrections need strokes "
         "that the noise does not hide",
     )
+    count_reset: Literal["absorbed", "raw"] = Field(
+        "absorbed",
+        description="what the policy notices of a stage change, where the observation normaliser's count is set to 1: "
+        "absorbed: nothing, the network's first weights follow the moments; raw: the moments jump under the same "
+        "weights, as in the paper",
+    )
+
+    @model_validator(mode="after")
+    def _shares_are_three(self) -> Self:
+        shares = self.stage_shares
+        usable = len(shares) == LAST_STAGE and min(shares) >= 0 and math.isclose(sum(shares), 1.0)
+        if shares and not usable:
+            raise ValueError(
+                f"stage_shares {','.join(f'{share:g}' for share in shares)}; "
+                "allowed: empty, or three numbers from 0 that sum to 1"
+            )
+        if shares and shares[-1] == 0:
+            raise ValueError("stage_shares with 0 for stage 3; allowed: above 0, since stage 3 is the last")
+        return self
+
+    def check_budget(self, frames: int) -> None:
+        """Raise ValueError if stages are shares of a number of frames that is not set."""
+        if self.stage_shares and not frames:
+            raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
 
     @property
-    def epochs(self) -> int:
-        """Return the epochs of all stages from the first one."""
+    def epochs(self) -> int | None:
+        """Return the epochs of all stages from the first one; None: shares of the frames decide."""
+        if self.stage_shares:
+            return None
         return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])
 
 
-def next_stage(stage: int, epochs_in_stage: int, catch_rate: float, config: CurriculumConfig) -> int:
-    """Return the stage of the next epoch.
+@dataclass(frozen=True, slots=True)
+class Trained:
+    """How much is trained."""
+
+    stage: int
+    epochs_in_stage: int
+    epochs: int  # of the whole run
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class StageLengths:
+    """How long the stages of one run are.
 
     Args:
-        stage: Of the epoch just trained.
-        epochs_in_stage: Epochs trained in it so far.
-        catch_rate: Measured over the last epochs with exploration noise; nan: not measured.
         config: Lengths and gates.
+        frames: That the run may train; the stages' shares are shares of it.
     """
-    if stage == 1 and 0 < config.catch_gate <= catch_rate:
-        return 2
-    length = (config.stage_1, config.stage_2, config.stage_3)[stage - 1]
-    if stage < 3 and epochs_in_stage >= length:
-        following = stage + 1
-        return following if following == 3 or config.stage_2 > 0 else 3
-    return stage
+
+    config: CurriculumConfig
+    frames: int = 0
+
+    def ends(self) -> tuple[int, ...]:
+        """Return the frames at which each stage ends; stages before the first one give their share to the others."""
+        config = self.config
+        shares = [
+            0.0 if stage < config.first_stage else share for stage, share in enumerate(config.stage_shares, 1)
+        ]
+        # rounded: 0.14 of 10,000 is 1,400.0000000000002, which would take one more dataset
+        return tuple(
+            round(self.frames * sum(shares[:stage]) / sum(shares)) for stage in range(1, LAST_STAGE + 1)
+        )
+
+    def gone(self, trained: Trained) -> float:
+        """Return the share of the present stage that is trained; 1 or more: it is over."""
+        config = self.config
+        if config.stage_shares:
+            start, end = (0, *self.ends())[trained.stage - 1 : trained.stage + 1]
+            return (trained.frames - start) / (end - start) if end > start else 1.0
+        length = (config.stage_1, config.stage_2, config.stage_3)[trained.stage - 1]
+        return trained.epochs_in_stage / max(length, 1)
+
+    def next_stage(self, trained: Trained, catch_rate: float) -> int:
+        """Return the stage of the next epoch.
+
+        Args:
+            trained: With the epoch just trained.
+            catch_rate: Measured over the last epochs with exploration noise; nan: not measured.
+        """
+        config, stage = self.config, trained.stage
+        if stage == 1 and 0 < config.catch_gate <= catch_rate:
+            return self.after(1)
+        return self.after(stage) if stage < LAST_STAGE and self.gone(trained) >= 1.0 else stage
+
+    def after(self, stage: int) -> int:
+        """Return the stage that follows ``stage``, which is 1 or 2: a stage 2 of no length is left out."""
+        length = self.config.stage_shares[1] if self.config.stage_shares else self.config.stage_2
+        return 2 if stage == 1 and length > 0 else LAST_STAGE
+
+    def datasets_left(self, trained: Trained) -> int:
+        """Return how many datasets the present stage still takes, at least 1.
+
+        With shares, future datasets count as large as those so far; before the first one it is 1.
+        """
+        config = self.config
+        if config.stage_shares:
+            left = self.ends()[trained.stage - 1] - trained.frames
+            return max(1, math.ceil(left * trained.epochs / trained.frames)) if trained.frames else 1
+        if trained.stage == LAST_STAGE:  # it also takes the epochs that a gate saved
+            return max(1, (config.epochs or 0) - trained.epochs)
+        return max(1, (config.stage_1, config.stage_2)[trained.stage - 1] - trained.epochs_in_stage)
+
+    def learning_rate_bound(self, trained: Trained, highest: float, lowest: float) -> float:
+        """Return the learning rate's upper bound: constant, then linear to ``lowest`` over the last stage."""
+        return highest if trained.stage < LAST_STAGE else decayed(self.gone(trained), highest, lowest)
 
 
 def decayed(gone: float, highest: float, lowest: float) -> float:
     """Return a learning rate that falls linearly from ``highest`` to ``lowest`` as ``gone`` rises from 0 to 1."""
     return highest + min(gone, 1.0) * (lowest - highest)
-
-
-def learning_rate_bound(
-    stage: int, epochs_in_stage: int, highest: float, lowest: float, config: CurriculumConfig
-) -> float:
-    """Return the learning rate's upper bound: constant, then linear to ``lowest`` over the last stage."""
-    if stage < 3 or config.stage_3 == 0:
-        return highest
-    return decayed(epochs_in_stage / config.stage_3, highest, lowest)

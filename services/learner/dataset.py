@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,21 +9,14 @@ import torch
 from torch import Tensor
 
 from common.comms.messages import Rollout
-from common.env.teacher import COMING, MEMORY_JOINTS
 from common.policy.actor_critic import ActorCritic, log_prob
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
-from common.task.observation import OBSERVATION, offsets
 from services.learner.advantage import gae
-from services.learner.bptt import ArmRollout
-from services.learner.differentiable_arm import ArmModel
 from services.learner.epoch_stats import PlayStats, play_stats
 from services.learner.ppo import Dataset, PPOConfig, arithmetic, denormalized, explained_variance
 
 Floats = npt.NDArray[np.float32]
-
-_JOINTS: Final = slice(offsets(OBSERVATION)["joint_pos"].start, offsets(OBSERVATION)["joint_vel"].stop)
-MEMORY_WEIGHT: Final = 3.0  # added to 1: the memory is in differences of a tenth of a joint's usual deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +44,6 @@ class Distillation:
 
     teacher: TeacherConfig
     is_on: bool  # the policy still imitates the teacher
-    arm: ArmModel | None  # None: gradients do not pass through the arm
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,13 +69,9 @@ class _Part:
     log_prox: Tensor  # (n,)
     mean: Tensor  # (n, A)
     corrections: Tensor  # (n, A)
-    correction_weights: Tensor  # (n, A)
     advantages: Floats  # (n,)
     values: Floats  # (n,)
     moments: Moments  # of the raw observations
-    joints: Floats  # (n, 14) joint positions and velocities
-    ended: npt.NDArray[np.bool_]  # (n,)
-    shape: tuple[int, int]  # (T, B)
 
 
 def read(
@@ -126,8 +113,6 @@ def read(
         advantages=torch.from_numpy(advantage),
         value_targets=torch.from_numpy(((target - moments.mean) / scale).astype(np.float32)),
         corrections=torch.cat([part.corrections for part in parts]),
-        correction_weights=torch.cat([part.correction_weights for part in parts]),
-        motion=_arm_rollout(parts, actions, distillation, model.obs_moments),
     )
     return Batch(
         data=data,
@@ -164,7 +149,6 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
     # A teacher's last corrections arrive when the policy already learns from rewards. They are not hit corrections.
     is_late = distillation.teacher.teaches(r.version) and not distillation.is_on
     corrections = np.zeros_like(r.corrections) if is_late else r.corrections
-    raw = r.obs.reshape(-1, model.obs_size)
     return _Part(
         obs=obs,
         actions=actions,
@@ -172,34 +156,7 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
         log_prox=log_prob(actions, mean, log_std),
         mean=mean,
         corrections=torch.tensor(corrections.reshape(-1, corrections.shape[-1])),
-        correction_weights=torch.from_numpy(_weights(r, distillation)).reshape(-1, r.actions.shape[-1]),
         advantages=advantage.reshape(-1),
         values=values.reshape(-1),
-        moments=Moments.of(raw),
-        joints=raw[:, _JOINTS],
-        ended=(r.terminated | r.truncated).reshape(-1),
-        shape=(steps, count),
-    )
-
-
-def _weights(rollout: Rollout, distillation: Distillation) -> Floats:
-    """Return the weights of the corrections (T, B, A): larger where the arm is used as memory."""
-    weights = np.ones_like(rollout.actions)
-    if distillation.is_on and distillation.teacher.arm_memory:
-        weights[..., MEMORY_JOINTS] += MEMORY_WEIGHT * rollout.obs[..., COMING, None]
-    return weights
-
-
-def _arm_rollout(
-    parts: Sequence[_Part], actions: Tensor, distillation: Distillation, moments: Moments
-) -> ArmRollout | None:
-    """Return the arms' motion under a dataset's actions (N, A), or None if gradients do not pass through the arm."""
-    if distillation.arm is None or not distillation.is_on:
-        return None
-    frames = torch.split(torch.arange(len(actions)), [len(part.actions) for part in parts])
-    rows = tuple(some.reshape(part.shape) for some, part in zip(frames, parts, strict=True))
-    joints = np.concatenate([part.joints for part in parts])
-    ended = np.concatenate([part.ended for part in parts])
-    return ArmRollout.of(
-        distillation.arm, rows, torch.from_numpy(joints), actions, torch.from_numpy(ended), moments
+        moments=Moments.of(r.obs.reshape(-1, model.obs_size)),
     )

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from common.comms.messages import Rollout
 from common.task.reward import TERMS
 from common.task.states import Outcome
+from services.learner.curriculum import Trained
 from services.learner.divergence import Health
 from services.learner.ppo import UpdateStats
 
@@ -30,6 +31,11 @@ class Progress:
     rollbacks: int = 0  # times that training went back to a good checkpoint
     closing: int = 0  # datasets that the stage still takes after its gate has opened; 0: it has not opened
     refitting_since: int = 0  # epoch of the stage in which refitting began
+
+    @property
+    def trained(self) -> Trained:
+        """How much is trained, as the curriculum counts it."""
+        return Trained(self.stage, self.epochs_in_stage, self.epoch, self.frames)
 
     @property
     def is_worth_going_back_to(self) -> bool:

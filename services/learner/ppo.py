@@ -23,7 +23,6 @@ from torch import Tensor
 
 from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
 from common.policy.normalizer import Moments
-from services.learner.bptt import ArmRollout, replayed
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
@@ -46,10 +45,17 @@ class PPOConfig(BaseModel):
     entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
     bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
     gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
+    schedule: Literal["adaptive", "constant_then_linear"] = Field(
+        "adaptive",
+        description="of the learning rate: adaptive: it follows the KL divergence of each pass; constant_then_linear: "
+        "learning_rate, and over the last stage linearly to learning_rate_min, as in the paper",
+    )
     learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
-    learning_rate_min: float = Field(2e-5, gt=0, le=0.1, description="lower bound of the adaptation")
+    learning_rate_min: float = Field(
+        2e-5, gt=0, le=0.1, description="lower bound of the adaptation; end of the linear decay"
+    )
     learning_rate_max: float = Field(
-        1e-3, gt=0, le=0.1, description="upper bound; decays over the last stage"
+        1e-3, gt=0, le=0.1, description="upper bound of the adaptation; decays over the last stage"
     )
     target_kl: float = Field(
         0.01, gt=0, le=1, description="KL(prox, new) that the adapted learning rate aims at"
@@ -78,6 +84,11 @@ class PPOConfig(BaseModel):
                 f"learning_rate_min {self.learning_rate_min:g}; "
                 f"allowed: up to learning_rate_max, {self.learning_rate_max:g}"
             )
+        if self.schedule == "constant_then_linear" and self.learning_rate_min > self.learning_rate:
+            raise ValueError(
+                f"learning_rate_min {self.learning_rate_min:g}; "
+                f"allowed: up to learning_rate, {self.learning_rate:g}, under schedule constant_then_linear"
+            )
         return self
 
 
@@ -96,8 +107,6 @@ class Dataset:
     corrections: (
         Tensor  # (N, A) target change of the mean action (or the teacher's); rows of zeros: no correction
     )
-    correction_weights: Tensor  # (N, A)
-    motion: ArmRollout | None = None  # the arms' motion, if gradients pass through it
 
 
 class UpdateMode(Enum):
@@ -142,9 +151,7 @@ def arithmetic(precision: str) -> torch.autocast:
     if precision == "auto":
         can = torch.cpu.get_capabilities()
         precision = "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
-    # Without the cache of cast weights, so that gradients over an arm's steps are summed in float32
-    enabled = precision == "bfloat16"
-    return torch.autocast("cpu", torch.bfloat16, enabled=enabled, cache_enabled=False)
+    return torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16")
 
 
 def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
@@ -155,7 +162,7 @@ def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: T
     return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
 
 
-def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor, correction_weights: Tensor) -> Tensor:
+def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
     """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
 
     The corrected action is acted + correction. A hit correction is added to the mean at the start of this update,
@@ -166,29 +173,16 @@ def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor, correction
         acted: (N, A).
         corrections: (N, A); a row of zeros is no correction. A zero in any other row leaves that action as it was (an
             action that was clipped, a drive at its limit).
-        correction_weights: (N, A).
     """
-    weights = correction_weights * (corrections != 0.0).any(-1, keepdim=True)
-    return 0.5 * ((mean - acted - corrections).square() * weights).sum(-1).mean()
+    is_corrected = (corrections != 0.0).any(-1, keepdim=True)
+    return 0.5 * ((mean - acted - corrections).square() * is_corrected).sum(-1).mean()
 
 
-def minibatches(data: Dataset, size: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Yield one pass over a dataset: frames (n,), or (T, b) in the order of play if gradients pass through the arm."""
-    if data.motion is not None:
-        yield from data.motion.batches(size, generator)
-        return
-    count = len(data.obs)
+def minibatches(count: int, size: int, generator: torch.Generator) -> Iterator[Tensor]:
+    """Yield one pass over ``count`` frames: rows (n,) in random order."""
     for rows in torch.split(torch.randperm(count, generator=generator), size):
         if len(rows) >= min(size, count) // 2:  # a small remainder would weigh as much as a full batch
             yield rows
-
-
-def played(network: ActorCritic, data: Dataset, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Return mean actions (n, A) and values (n,) of one minibatch."""
-    if data.motion is not None:
-        return replayed(network, data.obs, data.actions, data.mean_prox, data.motion, rows)
-    mean, values = network(data.obs[rows])
-    return mean.float(), values.float()
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -235,14 +229,14 @@ def _losses(
     network: ActorCritic,
     data: Dataset,
     config: PPOConfig,
-    batch: Tensor,
+    rows: Tensor,
     mode: UpdateMode,
     is_corrected: bool,
 ) -> _Losses:
     """Return the losses of one minibatch."""
     with arithmetic(config.precision):
-        mean, values = played(network, data, batch)
-    rows = batch.flatten()
+        mean, values = network(data.obs[rows])
+    mean, values = mean.float(), values.float()
     log_new = log_prob(data.actions[rows], mean, network.log_std)
     loss_policy = torch.zeros(())
     if mode is UpdateMode.PPO:
@@ -256,7 +250,7 @@ def _losses(
     if is_corrected:
         # A teacher's correction is relative to the played action, a hit's to the mean action
         acted = (data.actions if mode is UpdateMode.DISTILL else data.mean_prox)[rows]
-        loss_correction = correction_loss(mean, acted, data.corrections[rows], data.correction_weights[rows])
+        loss_correction = correction_loss(mean, acted, data.corrections[rows])
         loss = loss + config.correction_weight * loss_correction
     if config.entropy_weight > 0:
         loss = loss - config.entropy_weight * entropy(network.log_std)
@@ -299,8 +293,8 @@ def update(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
-        for batch in minibatches(data, config.minibatch, generator):
-            losses = _losses(network, data, config, batch, mode, is_corrected)
+        for rows in minibatches(len(data.obs), config.minibatch, generator):
+            losses = _losses(network, data, config, rows, mode, is_corrected)
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()  # type: ignore[no-untyped-call]
             norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
@@ -308,7 +302,6 @@ def update(
                 finite = False
                 continue
             optimizer.step()
-            rows = batch.flatten()
             with torch.no_grad():
                 kl = float(
                     kl_divergence(data.mean_prox[rows], data.log_std_prox, losses.mean, network.log_std)
@@ -326,7 +319,7 @@ def update(
             kl_sum += kl
             steps, batches = steps + 1, batches + 1
         kl = kl_sum / max(batches, 1)
-        if mode is UpdateMode.PPO:
+        if mode is UpdateMode.PPO and config.schedule == "adaptive":
             learning_rate = adapted_learning_rate(
                 learning_rate, kl, config.learning_rate_min, rate.highest, config.target_kl
             )

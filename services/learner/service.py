@@ -8,12 +8,7 @@ from threading import Event
 from typing import Final
 
 from common.comms.codec import encode
-from common.comms.messages import (
-    ActorReport,
-    Rollout,
-    StageChange,
-    Verdict,
-)
+from common.comms.messages import ActorReport, Rollout, StageChange, Verdict
 from common.comms.transport import Transport
 from common.env.robot import home_action
 from common.env.teacher import teacher_of
@@ -29,7 +24,6 @@ from services.learner.admission import LearnerState, open_rollout
 from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
-from services.learner.differentiable_arm import ArmModel
 from services.learner.divergence import NOT_FINITE
 from services.learner.intake import Intake
 from services.learner.ledger import AccountSnapshot, Ledger
@@ -102,7 +96,7 @@ class LearnerService:
             observation=task.observation,
             divergence=config.divergence,
             teacher=teacher,
-            arm=ArmModel(task.robot, task.control_rate_hz) if teacher.bptt else None,
+            frames=config.frames,
         )
         self._training_hash = training_hash(task, config.network, config.experience)
         self._generation = int(time.time())
@@ -121,7 +115,9 @@ class LearnerService:
         identity = Identity(
             config.run, self._generation, contract_hash(task, config.network), self._training_hash
         )
-        self._broadcast = Broadcast(transport, keys, self.training, identity, stages)
+        self._broadcast = Broadcast(
+            transport, keys, self.training, identity, stages, config.evaluated_weights
+        )
         self._members = transport.watch_alive(keys.every_alive())
         self._has_nothing_left = False
         self._warned = False
@@ -169,7 +165,7 @@ class LearnerService:
         """Train until the budget is spent or ``stop`` is set; the run folder is complete afterwards."""
         config = self._config
         log.info(
-            "listening endpoint=%s run=%s epoch=%d of=%d; waiting for actors, start one with: python -m services.actor "
+            "listening endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
             "--run %s --endpoint %s (and rallies with: python -m services.generator --run %s --endpoint %s)",
             config.endpoint,
             config.run,
@@ -230,9 +226,8 @@ class LearnerService:
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
         if self.training.progress.is_worth_going_back_to:
             checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
-        save_policy(
-            self._folder.latest_policy, self.training.average, self.training.obs_moments, self._contract()
-        )
+        weights = self.training.weights(self._config.evaluated_weights)
+        save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
         log.debug("checkpoint written file=%s", path)
 
@@ -395,6 +390,11 @@ class LearnerService:
         ledger, queued = self.ledger(), self._intake.queued
         telemetry.measure_state(self._metrics, ledger, self._intake, (role for role, _, _ in self._alive))
         counters, gauges = telemetry.heartbeat(
-            self.training.progress, self._config.curriculum.epochs, self.seconds, ledger, queued, self._last
+            self.training.progress,
+            self._config.curriculum.epochs or 0,
+            self.seconds,
+            ledger,
+            queued,
+            self._last,
         )
         self._member.beat(counters, gauges)

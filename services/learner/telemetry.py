@@ -103,7 +103,7 @@ def heartbeat(
 
     Args:
         progress: Of training.
-        epochs: Of the whole curriculum.
+        epochs: Of the whole curriculum; 0: its stages are shares of the frames.
         seconds: Training time, through restarts [s].
         ledger: Of all actors.
         queued: Rollouts that wait for an update.

@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -15,15 +15,15 @@ from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import TeacherConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
-from services.learner.curriculum import CurriculumConfig, decayed, learning_rate_bound, next_stage
+from services.learner.curriculum import CurriculumConfig, StageLengths, Trained, decayed
 from services.learner.dataset import Batch, Distillation, Model, read
-from services.learner.differentiable_arm import ArmModel
 from services.learner.divergence import DivergenceConfig, Health, divergence, running_mean, watched
 from services.learner.epoch_stats import EpochStats, Progress
 from services.learner.ppo import LearningRate, PPOConfig, UpdateMode, update
 
 Floats = npt.NDArray[np.float32]
 
+EvaluatedWeights = Literal["mean", "newest"]
 AVERAGE_DECAY: Final = 0.99  # of the weights' running mean, per dataset: it covers about 0.8 M frames
 
 
@@ -40,7 +40,7 @@ class Training:
         observation: What policy and critic observe.
         divergence: When training counts as diverged.
         teacher: The policy that it learns from first, if any.
-        arm: The task's robot, if gradients pass through it while the policy imitates a teacher; else None.
+        frames: That the run may train; 0: not set.
     """
 
     def __init__(
@@ -54,23 +54,23 @@ class Training:
         observation: ObservationConfig = PAPER_OBSERVATION,
         divergence: DivergenceConfig = DivergenceConfig(),
         teacher: TeacherConfig = TeacherConfig(),
-        arm: ArmModel | None = None,
+        frames: int = 0,
     ) -> None:
         torch.set_num_threads(1)  # more threads fight the actors for the same cores
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.network: ActorCritic = new_network(network, observation, home_action)
         # The noise of every dataset also moves the weights. Their running mean plays better (Polyak and Juditsky 1992;
-        # Hilton et al. 2022 average a policy in the same way). The mean is evaluated and saved.
+        # Hilton et al. 2022 average a policy in the same way).
         self.average: ActorCritic = copy.deepcopy(self.network)
         self.network_config = network
         self.obs_size = size(critic_layout(observation))
         self.ppo = ppo
         self.curriculum = curriculum
+        self.stages = StageLengths(curriculum, frames)
         self.notice = notice
         self.divergence = divergence
         self.teacher = teacher
-        self.arm = arm
         self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
@@ -83,12 +83,7 @@ class Training:
 
         A gate may end stage 1 earlier. It opens ``notice`` datasets ahead, so that no collected dataset is lost.
         """
-        config, progress = self.curriculum, self.progress
-        if progress.closing:
-            return progress.closing
-        if progress.stage == 3:  # the last stage also takes the epochs that a gate saved
-            return max(1, config.epochs - progress.epoch)
-        return max(1, (config.stage_1, config.stage_2)[progress.stage - 1] - progress.epochs_in_stage)
+        return self.progress.closing or self.stages.datasets_left(self.progress.trained)
 
     @property
     def is_distilling(self) -> bool:
@@ -112,20 +107,14 @@ class Training:
         before = self.progress
         batch = self.read(rollouts, on_tick)
         self.value_moments = batch.value_moments
-        bound = learning_rate_bound(
-            before.stage,
-            before.epochs_in_stage,
-            self.ppo.learning_rate_max,
-            self.ppo.learning_rate_min,
-            self.curriculum,
-        )
+        ppo = self.ppo
+        highest = ppo.learning_rate_max if ppo.schedule == "adaptive" else ppo.learning_rate
+        bound = self.stages.learning_rate_bound(before.trained, highest, ppo.learning_rate_min)
         # After a stage change the policy waits for a critic that explains the new rewards.
         refitted = before.epochs_in_stage - before.refitting_since
         is_refitting = before.refitting and (
             refitted < self.ppo.refit_epochs and batch.explained < self.ppo.refit_variance
         )
-        if self.is_distilling:
-            self._cap_log_std(self.teacher.max_log_std)
         mode = (
             UpdateMode.CRITIC_ONLY
             if is_refitting
@@ -137,7 +126,7 @@ class Training:
             self.network,
             self.optimizer,
             batch.data,
-            self.ppo,
+            ppo,
             LearningRate(self._rate(mode, bound), bound),
             self.generator,
             batch.explained,
@@ -149,7 +138,7 @@ class Training:
             moments = moments.merged(part)
         # No tick until the weights below have changed too: a request then gets a consistent policy.
         self.obs_moments = moments
-        if before.stage_number > 0:
+        if before.stage_number > 0 and self.curriculum.count_reset == "absorbed":
             # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset. The
             # network must not play differently because of it.
             for network in (self.network, self.average):
@@ -158,11 +147,13 @@ class Training:
         play = batch.play
         running = running_mean(before.catch_rate, play.catch_rate)
         # The gate is left out here: when it opens, rollouts of this stage are in flight, and are trained on first.
-        stage = next_stage(before.stage, before.epochs_in_stage + 1, float("nan"), self.curriculum)
-        due = next_stage(before.stage, before.epochs_in_stage + 1, running, self.curriculum)
+        trained = Trained(
+            before.stage, before.epochs_in_stage + 1, before.epoch + 1, before.frames + batch.frames
+        )
+        stage, due = (self.stages.next_stage(trained, rate) for rate in (float("nan"), running))
         closing = before.closing - 1 if before.closing else self.notice if due != stage else 0
         if before.closing == 1:
-            stage = 2 if self.curriculum.stage_2 > 0 else 3
+            stage = self.stages.after(before.stage)
         changed = stage != before.stage
         rate = play.return_rate if before.stage == 3 else play.catch_rate
         # While only the critic learns, the policy cannot diverge.
@@ -171,11 +162,11 @@ class Training:
             self._enter(stage)
         self.progress = Progress(
             version=before.version + 1,
-            epoch=before.epoch + 1,
-            frames=before.frames + batch.frames,
+            epoch=trained.epochs,
+            frames=trained.frames,
             stage=stage,
             stage_number=before.stage_number + changed,
-            epochs_in_stage=0 if changed else before.epochs_in_stage + 1,
+            epochs_in_stage=0 if changed else trained.epochs_in_stage,
             learning_rate=before.learning_rate if is_refitting else stats.learning_rate,
             refitting=changed or is_refitting,
             catch_rate=running,
@@ -190,7 +181,7 @@ class Training:
     def read(self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None) -> Batch:
         """Return the data of the next epoch from its rollouts; nothing is changed."""
         model = Model(self.network, self.obs_moments, self.value_moments, self.obs_size, self.ppo)
-        distillation = Distillation(self.teacher, self.is_distilling, self.arm)
+        distillation = Distillation(self.teacher, self.is_distilling)
         return read(rollouts, model, distillation, self.progress.version, on_tick)
 
     def _rate(self, mode: UpdateMode, bound: float) -> float:
@@ -199,7 +190,12 @@ class Training:
         if mode is UpdateMode.DISTILL:
             share = self.progress.version / self.teacher.epochs
             return decayed(share, ppo.learning_rate, ppo.learning_rate_min)
-        return bound if mode is UpdateMode.CRITIC_ONLY else min(self.progress.learning_rate, bound)
+        is_bound = mode is UpdateMode.CRITIC_ONLY or ppo.schedule == "constant_then_linear"
+        return bound if is_bound else min(self.progress.learning_rate, bound)
+
+    def weights(self, which: EvaluatedWeights) -> ActorCritic:
+        """Return the network with the newest weights, or the one with their running mean."""
+        return self.average if which == "mean" else self.network
 
     @torch.no_grad()
     def _update_ema(self) -> None:

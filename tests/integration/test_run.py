@@ -3,9 +3,13 @@
 import csv
 import json
 
+import pytest
+import torch
+
 from common.policy.folder import load_policy
 from common.task.experience import ExperienceConfig
-from tests.integration.in_process_run import CURRICULUM, local_run, wait_until
+from services.learner.curriculum import CurriculumConfig
+from tests.integration.in_process_run import CURRICULUM, PPO, local_run, wait_until
 from tests.unit.env.teachers import write_teacher
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
@@ -49,6 +53,29 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
         json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
     )
     assert list((tmp_path / "tb").iterdir())
+
+
+def test_a_run_with_the_papers_switches_changes_stages_by_frames_and_saves_its_newest_weights(tmp_path):
+    curriculum = CurriculumConfig(stage_shares=(0.375, 0.25, 0.375), count_reset="raw")
+    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_epochs": 0})
+    with local_run(tmp_path, curriculum=curriculum, ppo=ppo, frames=8 * 512, evaluated_weights="newest") as s:
+        learner = s.learner()
+        generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
+        learner.join(60)
+        for entry in (*actors, evaluator, generator):
+            entry.end()
+        training, final = learner.service.training, learner.service.ledger()
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    saved = load_policy(tmp_path / "policy" / "latest")
+
+    assert [int(row["stage"]) for row in rows] == [1, 1, 2, 2, 3, 3, 3, 3]
+    assert [float(row["learning_rate"]) for row in rows] == pytest.approx(
+        [5e-4] * 6 + [5e-4 - k / 3 * 4.8e-4 for k in (1, 2)]
+    )
+    assert final.balance == final.lost == 0
+    assert torch.equal(saved.network.log_std, training.network.log_std)
+    assert not torch.equal(saved.network.log_std, training.average.log_std)
 
 
 def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp_path):

@@ -5,7 +5,7 @@ from typing import Final
 
 from common.service import metrics
 from common.task import observation_reference
-from topspin.reference import configuration, protocol, sequences, state_diagram
+from topspin.reference import configuration, protocol, robots, sequences, state_diagram
 
 FOLDER: Final = Path("docs/reference")  # from the project's folder
 
@@ -14,6 +14,7 @@ def files() -> dict[str, str]:
     """Return the content of each generated file by its name in `FOLDER`."""
     return {
         "observation.md": observation_reference.markdown(),
+        "robots.md": robots.markdown(),
         "metrics.md": metrics.markdown(),
         "protocol.md": protocol.markdown(),
         "configuration.md": configuration.markdown(),

@@ -104,7 +104,7 @@ def pictures(rallies: Sequence[RecordedRally], options: FilmOptions) -> Iterator
     hold, fade = round(HOLD_S * options.rate_hz), round(FADE_S * options.rate_hz)
     lettering = Lettering(options.height)
     last: Image | None = None
-    with Painter(options.width, options.height) as painter:
+    with Painter(options.width, options.height, rallies[0].robot) as painter:
         for number, rally in enumerate(rallies):
             path = path_of(rally)
             for index, time in enumerate(picture_times(rally, options)):

@@ -1,4 +1,4 @@
-"""The model that is drawn: the robot of ``common/env/robot.xml`` in a hall, for pictures.
+"""The model that is drawn: a robot of ``common/robot/robots`` in a hall, for pictures.
 
 Only looks are added: the robot's bodies and joints are those of training, so its seven joint positions pose it.
 This model is not simulated, and the training's model has none of its additions.
@@ -9,8 +9,6 @@ from typing import Final, NamedTuple
 import mujoco
 import numpy as np
 
-from common.env.robot import MODEL_PATH
-from common.physics.arm import RACKET_HALF_THICKNESS, RACKET_RADIUS
 from common.physics.constants import (
     BALL_RADIUS,
     FLOOR_Z,
@@ -20,6 +18,8 @@ from common.physics.constants import (
     TABLE_HALF_WIDTH,
     TABLE_THICKNESS,
 )
+from common.robot.description import model_path
+from common.robot.model import robot_xml
 
 Triple = tuple[float, float, float]
 BALL: Final = "ball"
@@ -91,10 +91,10 @@ def _disc(
 
 
 _UPRIGHT: Final = (1.0, 0.0, 0.0, 0.0)
-_R, _H = RACKET_RADIUS, RACKET_HALF_THICKNESS
+_R, _H = 0.076, 0.0065  # [m] the racket's radius and half thickness
 
 # Body, finish, shape, place and half sizes [m] in the body's frame, turn
-PARTS: Final = (
+HALL_PARTS: Final = (
     # table: lines, frame, legs
     _box("world", "line", (0.0, _W - _LINE, _THIN), (_L, _LINE, _THIN)),
     _box("world", "line", (0.0, -_W + _LINE, _THIN), (_L, _LINE, _THIN)),
@@ -118,6 +118,10 @@ PARTS: Final = (
         _box("world", "frame", (0.0, side * (NET_HALF_WIDTH + _W) / 2, -0.03), (0.02, 0.09, 0.012))
         for side in (-1, 1)
     ),
+)
+
+# Robots with the model of ``rails``
+GANTRY_PARTS: Final = (
     # gantry: two rails on legs, outside the table
     *(
         _box(
@@ -153,8 +157,8 @@ PARTS: Final = (
     *(_box("beam", "motor", (x, 0.0, 0.0), (0.002, 1.09, 0.010)) for x in (-0.050, 0.050)),
     # carriage and column
     _box("carriage", "accent", (0.0, 0.0, 0.042), (0.06, 0.06, 0.003)),
-    _disc("yaw", "motor", (0.0, 0.0, 0.06), 0.065, 0.02, _UPRIGHT),
-    _disc("yaw", "accent", (0.0, 0.0, 0.083), 0.055, 0.003, _UPRIGHT),
+    _disc("carriage", "motor", (0.0, 0.0, 0.06), 0.065, 0.02, _UPRIGHT),
+    _disc("carriage", "accent", (0.0, 0.0, 0.083), 0.055, 0.003, _UPRIGHT),
     # joints: motor housings across the arm, with caps
     _disc("upper_arm", "motor", (0.0, 0.0, 0.0), 0.050, 0.055, _ACROSS),
     *(_disc("upper_arm", "accent", (0.0, y, 0.0), 0.034, 0.003, _ACROSS) for y in (-0.057, 0.057)),
@@ -163,6 +167,9 @@ PARTS: Final = (
     _disc("wrist", "shell", (0.0, 0.0, 0.0), 0.033, 0.036, _ACROSS),
     *(_disc("wrist", "accent", (0.0, y, 0.0), 0.021, 0.003, _ACROSS) for y in (-0.038, 0.038)),
     _disc("wrist", "accent", (0.0, 0.0, 0.060), 0.027, 0.004, _UPRIGHT),
+)
+
+RACKET_PARTS: Final = (
     # racket: wood between two rubbers, red towards the opponent at home; handle up to the wrist
     _disc("racket", "wood", (0.0, 0.0, 0.0), _R + 0.0015, _H - 0.0045, _ALONG),
     _disc("racket", "red rubber", (-_H / 2 - 0.001, 0.0, 0.0), _R, _H / 2 - 0.001, _ALONG),
@@ -171,9 +178,12 @@ PARTS: Final = (
 )
 
 
-def load_hall() -> mujoco.MjModel:
+def load_hall(robot: str = "rails") -> mujoco.MjModel:
     """Return the compiled model: seven robot joints, then nothing else; the ball is a mocap body named ``ball``."""
-    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    spec = mujoco.MjSpec.from_string(robot_xml(robot))
+    is_gantry = model_path(robot) == model_path("rails")
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
     _set_up_light(spec)
     for name, finish in FINISHES.items():
         spec.add_material(
@@ -184,7 +194,7 @@ def load_hall() -> mujoco.MjModel:
             reflectance=finish.reflectance,
         )
     for geom in spec.geoms:
-        dress = _DRESS[geom.name]
+        dress = _DRESS.get(geom.name, "shell")
         if dress is None:
             geom.rgba = [0.0] * 4
             geom.group = 5
@@ -195,7 +205,7 @@ def load_hall() -> mujoco.MjModel:
     spec.geom("net").pos = [0.0, 0.0, NET_HEIGHT / 2 - 0.005]
     spec.geom("table").size = [_L, _W, TABLE_THICKNESS / 2]
     spec.geom("table").pos = [0.0, 0.0, -TABLE_THICKNESS / 2]
-    for body, of, shape, pos, size, quat in PARTS:
+    for body, of, shape, pos, size, quat in HALL_PARTS + (GANTRY_PARTS if is_gantry else ()) + RACKET_PARTS:
         geom = spec.body(body).add_geom(
             type=mujoco.mjtGeom(shape),
             pos=pos,

@@ -81,10 +81,11 @@ class Painter:
     Args:
         width: Picture's width [pixels].
         height: Picture's height [pixels].
+        robot: Its name.
     """
 
-    def __init__(self, width: int, height: int) -> None:
-        self._model = load_hall()
+    def __init__(self, width: int, height: int, robot: str = "rails") -> None:
+        self._model = load_hall(robot)
         self._model.vis.global_.fovy = FIELD_OF_VIEW_DEG
         self._data = mujoco.MjData(self._model)
         self._ball = self._model.body(BALL).mocapid[0]

@@ -67,7 +67,7 @@ def rally_picture(rally: RecordedRally, camera: CameraName, width: int, height: 
         verdict=f"lands {100 * rally.landing_error:.0f} cm from the target" if 3 in parts else "",
     )
     scale = OVERSAMPLED
-    with Painter(width * scale, height * scale) as painter:
+    with Painter(width * scale, height * scale, rally.robot) as painter:
         picture = painter.paint(moment, camera_at(camera, path, end))
     return smaller(Lettering(height * scale).write(picture, caption), scale)
 
@@ -77,7 +77,7 @@ def rally_strip(rally: RecordedRally, width: int, height: int) -> Image:
     path, scale = path_of(rally), OVERSAMPLED
     lettering = Lettering(3 * height * scale)
     parts = []
-    with Painter(width * scale, height * scale) as painter:
+    with Painter(width * scale, height * scale, rally.robot) as painter:
         for state, (start, end) in part_times(rally).items():
             time = start + _STRIP_SHARE[state] * (end - start)
             picture = painter.paint(moment_at(rally, path, time), _close(camera_at("follow", path, time)))

@@ -9,7 +9,7 @@ from topspin.report.collect import Run
 
 BOOKKEEPING: Final = frozenset(
     {
-        *("run", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
+        *("run", "recipe", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
         *("silence_warning_s", "checkpoint_interval_s"),
         *("endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib"),
         *("tls_ca", "tls_certificate", "tls_key", "metrics_host", "log_level", "status_interval_s"),
@@ -75,7 +75,6 @@ def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     critic = observation.get("critic", "policy")
     teacher = experience.get("teacher", {})
     distilled = f"distilled from {Path(teacher['policy']).name}" if teacher.get("policy") else ""
-    distilled += " with arm memory" if distilled and teacher.get("arm_memory") else ""
     return (
         (stages, stages),
         (distilled, distilled),

@@ -232,7 +232,7 @@ def _run_json(result: RunResult) -> dict[str, Any]:
     run, policy = result.run, result.run.policy
     of_policy = {} if policy is None else {
         name: getattr(policy.contract, name) for name in ("generation", "version", "stage", "frames")
-    }  # fmt: skip
+    } | {"end_to_end": policy.contract.is_end_to_end}  # fmt: skip
     return {
         "run": run.name,
         "seed": result.seed,

@@ -103,6 +103,12 @@ def _policies(one: GroupResult) -> str:
     return text
 
 
+def _end_to_end(one: GroupResult) -> str:
+    """Return "yes" if all policies of a row are end-to-end by their contracts, else "no"; a dash without policies."""
+    found = {policy.contract.is_end_to_end for result in one.runs if (policy := result.run.policy)}
+    return NOTHING if not found else "yes" if found == {True} else "no"
+
+
 def count_of(frames: int | None) -> str:
     """Return a number of frames as text."""
     return NOTHING if frames is None else f"{frames / 1e6:.1f} M"
@@ -127,7 +133,7 @@ def headline(found: Results) -> Table:
         rows.append(
             (
                 f"Topspin, {one.label} ({_policies(one)})",
-                "yes",
+                _end_to_end(one),
                 _rate_cell(one.spread.get("return_rate"), one.pooled["return_rate_ci"]),
                 _rate_cell(one.spread.get("return_after_catch"), one.pooled["return_after_catch_ci"]),
                 _metre_cell(one.spread.get("target_error_mean"), one.pooled["target_error_mean_ci"]),

@@ -21,7 +21,7 @@ def rows_of(result: MatchResult, seeds: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["default_paper", "paper_off"])
-def test_the_first_rallies_end_as_they_did_before_the_code_moved(name):
+def test_the_first_rallies_end_as_they_did_when_they_were_recorded(name):
     golden = load_golden()
     result = play(CASES[name], RALLIES)
     rows = rows_of(result, golden[f"{name}/seeds"])

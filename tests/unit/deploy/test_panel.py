@@ -1,4 +1,5 @@
 import io
+from dataclasses import replace
 
 from rich.console import Console
 
@@ -78,3 +79,13 @@ def test_the_budget_that_ends_first_decides_the_time_left():
     assert clock(3725.0) == "1:02:05"
     assert clock(None) == "-:--"
     assert time_left_s(View("night")) is None
+
+
+def test_without_a_number_of_epochs_the_frames_decide_the_time_left():
+    view = full_view()
+    status = view.statuses["learner", "0"]
+    gauges = {**status.gauges, "epochs": 0.0, "epoch": 900.0}
+    view.statuses["learner", "0"] = replace(status, gauges=gauges, counters={"frames": 30.0})
+    view.minutes, view.frames = 0.0, 100
+
+    assert share_done(view) == 0.3

@@ -4,13 +4,16 @@ import numpy as np
 import pytest
 
 from common.env import mujoco_ball
-from common.env.mujoco_ball import OBSTACLES, STEP, load_model
+from common.env.mujoco_ball import STEP, load_model, obstacles
 from common.env.rally_env import RallyEnv
-from common.physics.arm import racket_pose
+from common.physics.chain import racket_pose
 from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS
+from common.robot.chain_of import chain_of
 from common.task.launch import draw_rallies
 from common.task.states import State
 from tests.unit.env.rallies import PLAYED_OUT, QUIET, Deck, make_env, random_actions
+
+CHAIN = chain_of("rails")
 
 ORIGINAL = QUIET.model_copy(update={"collision": "original"})
 
@@ -24,7 +27,7 @@ def test_the_ball_in_the_model_has_the_balls_mass_inertia_and_radius():
     assert model.geom("ball").size[0] == BALL_RADIUS
 
 
-@pytest.mark.parametrize(("geom", "surface"), [(geom, surface) for geom, _, surface in OBSTACLES])
+@pytest.mark.parametrize(("geom", "surface"), [(geom, surface) for geom, _, surface in obstacles("rails")])
 def test_contact_parameters_are_as_documented(geom, surface):
     pair = load_model("rails").pair(f"ball on {geom}")
 
@@ -57,7 +60,7 @@ def test_without_an_obstacle_in_reach_one_long_step_is_as_good_as_ten_short_step
         return np.array(places), np.array(states), np.array(joints), float(np.mean(near))
 
     places, states, joints, near = play_all()
-    monkeypatch.setattr(mujoco_ball, "_within_reach", lambda qpos, qvel, path, out: out.fill(True))
+    monkeypatch.setattr(mujoco_ball, "_within_reach", lambda chain, qpos, qvel, path, out: out.fill(True))
     fine_places, fine_states, fine_joints, everything = play_all()
     off = np.linalg.norm(places - fine_places, axis=2)
     before_bounce, after_bounce = (
@@ -86,20 +89,20 @@ def test_a_ball_with_an_obstacle_within_reach_is_never_missed():
     aside, below = 0.035 + BALL_RADIUS + 0.027, 0.030 + BALL_RADIUS + 0.029
     bent.robot.qpos[0, 7:10] = (elbow_x + aside, 0.0, elbow_z - below)
     bent.robot.qvel[0, 7:13] = (0.0, 0.0, 8.0, 0.0, 0.0, 0.0)
-    mujoco_ball._within_reach(bent.robot.qpos, bent.robot.qvel, bent.robot._path, bent.robot._is_near)
+    mujoco_ball._within_reach(CHAIN, bent.robot.qpos, bent.robot.qvel, bent.robot._path, bent.robot._is_near)
     assert bent.robot._is_near[0]
     for _ in range(6):
         env.step(env.home_action + 0.5 * rng.standard_normal((512, 7)))
-        pose = np.array([racket_pose(tuple(q)).centre for q in env.robot.joint_pos])
+        pose = np.array([racket_pose(CHAIN, tuple(q)).centre for q in env.robot.joint_pos])
         spots = np.where(
             rng.random((512, 1)) < 0.5, pose, rng.uniform([-1.5, -0.8, 0], [1.4, 0.8, 0.2], (512, 3))
         )
         env.robot.qpos[:, 7:10] = spots + 0.07 * rng.standard_normal((512, 3))
         env.robot.qvel[:, 7:10] = 6.0 * rng.standard_normal((512, 3))
-        mujoco_ball._within_reach(env.robot.qpos, env.robot.qvel, env.robot._path, env.robot._is_near)
+        mujoco_ball._within_reach(CHAIN, env.robot.qpos, env.robot.qvel, env.robot._path, env.robot._is_near)
         is_near = env.robot._is_near.copy()
         records = env.robot._roll_out(np.arange(512), STEP, np.tile(env.robot.home, (512, 10, 1)))
-        touched = (records["sensordata"][:, :, 4:] > 0.0).any(axis=(1, 2))
+        touched = (records["sensordata"][:, :, 32:] > 0.0).any(axis=(1, 2))
         touches += (touched & is_near).sum()
         assert not (touched & ~is_near).any()
         env.reset()

@@ -6,18 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from common.env.robot import (
-    JOINTS,
-    MAX_ACTION_LATENCY,
-    MUJOCO_STEP,
-    RACKET_BODY,
-    USST_SPEED_LIMITS,
-    RobotBatch,
-    home_action,
-    load_model,
-)
-from common.physics.arm import racket_motion, racket_pose, racket_quaternion
+from common.env.robot import MAX_ACTION_LATENCY, MUJOCO_STEP, RobotBatch, home_action
+from common.physics.chain import quaternion_of, racket_motion, racket_pose
+from common.robot.chain_of import chain_of
+from common.robot.description import describe, robot_names
+from common.robot.model import load_model
 from common.task.randomization import PROFILES
+
+CHAIN = chain_of("rails")
 
 FINE_STEP = 0.00025  # [s] a sixteenth of the robot's
 HOME = home_action().astype(np.float64)
@@ -47,15 +43,21 @@ def racket_errors(actions: np.ndarray, step: float) -> tuple[np.ndarray, np.ndar
         fine.step(action)
         for a, b in zip(coarse.joint_pos, fine.joint_pos, strict=True):
             distances.append(
-                np.linalg.norm(np.subtract(racket_pose(tuple(a)).centre, racket_pose(tuple(b)).centre))
+                np.linalg.norm(
+                    np.subtract(racket_pose(CHAIN, tuple(a)).centre, racket_pose(CHAIN, tuple(b)).centre)
+                )
             )
-            cosine = np.dot(racket_quaternion(tuple(a)), racket_quaternion(tuple(b)))
+            cosine = np.dot(
+                quaternion_of(racket_pose(CHAIN, tuple(a))), quaternion_of(racket_pose(CHAIN, tuple(b)))
+            )
             turns.append(2.0 * np.arccos(np.clip(abs(cosine), 0.0, 1.0)))
     return np.array(distances), np.array(turns)
 
 
 def racket_speed(robot: RobotBatch) -> float:
-    return float(np.linalg.norm(racket_motion(tuple(robot.joint_pos[0]), tuple(robot.joint_vel[0]))[0]))
+    return float(
+        np.linalg.norm(racket_motion(CHAIN, tuple(robot.joint_pos[0]), tuple(robot.joint_vel[0]))[0])
+    )
 
 
 def drive(robot: RobotBatch, action: np.ndarray, steps: int) -> tuple[np.ndarray, float]:
@@ -113,7 +115,7 @@ def test_joints_overshoot_their_ranges_by_little_under_the_widest_targets():
 
     Measured: 4 mm, and 0.19 rad of the pitch, which carries the whole arm at 13 rad/s.
     """
-    overshoot = np.array([0.01, 0.01, 0.25, 0.25, 0.25, 0.25, 0.25])
+    overshoot = np.array([0.01, 0.01, 0.35, 0.35, 0.35, 0.35, 0.35])
     rng = np.random.default_rng(0)
     robot = RobotBatch(64)
     low, high = np.array(robot.model.jnt_range).T
@@ -126,25 +128,80 @@ def test_joints_overshoot_their_ranges_by_little_under_the_widest_targets():
             assert np.all(robot.joint_pos < high + overshoot)
 
 
-@pytest.mark.parametrize("joint", range(7), ids=JOINTS)
-def test_usst_joints_exceed_the_published_speeds_by_at_most_10_percent(joint):
-    """Each joint alone, to both stops. Gravity and the arm beyond a joint may push it faster than its drive can."""
-    for side in (-1.0, 1.0):
-        robot = RobotBatch(1, "usst")
-        action = HOME.copy()
-        action[joint] = side
-        joints, _ = drive(robot, action, steps=60)
-
-        assert joints[joint] <= 1.10 * USST_SPEED_LIMITS[joint]
+def uniform_targets(steps: int = 90, count: int = 64, seed: int = 0) -> np.ndarray:
+    """Return targets anywhere in the ranges that jump every 60 ms: all joints at once, far beyond any policy."""
+    return np.repeat(np.random.default_rng(seed).uniform(-1, 1, (steps // 3, count, 7)), 3, axis=0)
 
 
-def test_usst_differs_from_rails_only_in_its_lower_no_load_speeds():
+@pytest.mark.parametrize(
+    ("name", "limits"),
+    [
+        ("rails", [3.1, 3.3, 15.0, 15.0, 15.0, 15.0, 15.0]),
+        # published: rails [m/s]; yaw and pitch, then the last three joints [rad/s]
+        ("usst", [2.0, 2.0, 11.64, 11.64, 5.86, 5.86, 5.86]),
+        ("pro", [5.0, 5.0, 30.0, 30.0, 40.0, 40.0, 40.0]),
+        ("arm", [10.0, 10.0, 12.0, 15.0, 18.0, 18.0, 18.0]),
+    ],
+)
+def test_joints_in_coupled_motion_hold_their_speed_limits(name, limits):
+    """All joints at once, targets that jump: nothing but the drives holds the limits. Contacts are off.
+
+    Measured: at most 0.95, 1.16, 0.98 and 1.08 of the limit. The elbow of usst is the worst: its limit is low, and the
+    pitch, which carries it, has twice its torque and twice its speed.
+    """
+    robot = RobotBatch(64, name)
+    robot.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT.value
+    robot = RobotBatch(64, name, model=robot.model)
+    largest = np.zeros(7)
+    for action in uniform_targets():
+        motion = robot.step(action)
+        before = np.concatenate([motion.start_pos[:, None], motion.joint_pos[:, :-1]], axis=1)
+        speed = np.abs(motion.joint_pos - before) / robot.step_s
+        largest = np.maximum(largest, speed.max(axis=(0, 1)))
+
+    np.testing.assert_array_equal([joint.speed for joint in describe(name).joint], limits)
+    assert np.all(largest <= np.array(limits) * (1.2 if name == "usst" else 1.1))
+    assert largest.max() > 0.7 * min(limits)
+
+
+@pytest.mark.parametrize("name", robot_names())
+def test_a_link_that_strikes_the_robot_is_stopped_and_felt(name):
+    """Targets anywhere drive arm and racket into base, beam and column: the covers hold, and F_c has the force."""
+    robot = RobotBatch(64, name)
+    links = len(robot.description.links)
+    deepest, felt, struck = 0.0, 0.0, 0.0
+    targets = uniform_targets(seed=3)
+    if name == "arm":  # only where elbow and wrist fold
+        targets[:, :, [3, 5]] = 1.0
+    for action in targets:
+        motion = robot.step(action)
+        own = robot.sensors[:, :, links : 5 * links].reshape(64, -1, links, 4)
+        deepest = max(deepest, -own[..., 3].min())
+        force = np.linalg.norm(own[..., :3], axis=-1)
+        felt = max(felt, force.max())
+        struck = max(struck, motion.contact.max())
+
+        # the touch sensors, which are paid, measure at least what the covers do
+        assert np.all(motion.contact >= force - 1e-6)
+
+    assert felt > 50.0
+    assert struck >= felt
+    assert deepest < (0.080 if name == "pro" else 0.030)
+
+
+def test_usst_is_rails_with_the_published_speed_limits():
     ours, theirs = load_model("rails"), load_model("usst")
 
-    np.testing.assert_allclose(theirs.actuator_forcerange[:, 1] / theirs.dof_damping, USST_SPEED_LIMITS)
-    assert np.all(theirs.dof_damping > ours.dof_damping)
     np.testing.assert_array_equal(theirs.body_mass, ours.body_mass)
     np.testing.assert_array_equal(theirs.jnt_range, ours.jnt_range)
+    np.testing.assert_array_equal(theirs.actuator_forcerange, ours.actuator_forcerange)
+
+
+def test_the_stops_are_beyond_the_targets_of_every_robot():
+    for name in robot_names():
+        stops, joints = load_model(name).jnt_range, describe(name).joint
+        for (low, high), joint in zip(stops, joints, strict=True):
+            assert low < joint.range[0] < joint.range[1] < high
 
 
 def test_forces_stay_within_the_actuators_limits():
@@ -165,7 +222,7 @@ def test_the_racket_receives_an_impulse_within_one_control_step(control_rate_hz)
     linear, angular = np.empty((3, 7)), np.empty((3, 7))
     mujoco.mj_forward(pushed.model, data)
     mujoco.mj_fullM(pushed.model, data, inertia)
-    mujoco.mj_jacBody(pushed.model, data, linear, angular, pushed.model.body(RACKET_BODY).id)
+    mujoco.mj_jacBody(pushed.model, data, linear, angular, pushed.model.body("racket").id)
     momentum = linear.T @ impulse[0, :3] + angular.T @ impulse[0, 3:]
     pushed.push_racket(impulse)
     for robot in (pushed, free):
@@ -182,7 +239,7 @@ def test_the_racket_receives_an_impulse_within_one_control_step(control_rate_hz)
 def test_an_impulse_acts_only_in_the_next_control_step():
     impulse = np.array([[-0.03, 0.0, 0.01, 0.0, 0.0, 0.0]])
     robot = RobotBatch(1)
-    wrench = robot.batch.bind("xfrc_applied")[0, robot.model.body(RACKET_BODY).id]
+    wrench = robot.batch.bind("xfrc_applied")[0, robot.model.body("racket").id]
     robot.push_racket(impulse)
     force = wrench.copy()
     robot.step(HOME[None])

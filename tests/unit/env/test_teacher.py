@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from common.env.rally_env import RallyEnv
-from common.env.teacher import FIRST_MEASURED, MEMORY_JOINTS, STROKE, teacher_of
+from common.env.teacher import teacher_of
 from common.policy.contract import PolicyError
 from common.policy.folder import load_policy
 from common.task.config import TaskConfig
 from common.task.experience import TeacherConfig
 from common.task.launch import draw_rallies
-from common.task.observation import PAPER_OBSERVATION, ObservationConfig, offsets, policy_layout, size
+from common.task.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
 from tests.unit.env.rallies import Deck, random_actions
 from tests.unit.env.teachers import write_teacher
 
@@ -57,7 +57,8 @@ def test_an_extra_observation_without_its_options_is_refused():
 def test_advice_is_the_action_of_the_teachers_policy(tmp_path):
     teacher = teacher_of(PAPER, write_teacher(tmp_path / "t", observation=MORE))
     env = make_env(extra_observation=teacher.observation)
-    advice = teacher.advice(env, env.reset())
+    env.reset()
+    advice = teacher.advice(env)
 
     assert teacher.observation == MORE
     assert advice.shape == (6, 7)
@@ -68,57 +69,14 @@ def test_target_shrink_moves_the_teachers_targets_towards_the_courts_middle(tmp_
     config = write_teacher(tmp_path / "t", observation=MORE).model_copy(update={"target_shrink": 0.25})
     teacher = teacher_of(PAPER, config)
     env = make_env(extra_observation=teacher.observation)
-    student_obs = env.reset()
+    env.reset()
     moved = env.observe_extra()
     moved[:, 30] = 0.75 * moved[:, 30] + 0.25 * 0.685
     moved[:, 31] *= 0.75
 
     np.testing.assert_allclose(
-        teacher.advice(env, student_obs), load_policy(tmp_path / "t").act(moved).clip(-1, 1), atol=1e-6
+        teacher.advice(env), load_policy(tmp_path / "t").act(moved).clip(-1, 1), atol=1e-6
     )
-
-
-def test_arm_memory_holds_the_students_first_measurements_until_the_stroke(tmp_path):
-    config = write_teacher(tmp_path / "t", observation=MORE)
-    plain, remembering = (
-        teacher_of(PAPER, config.model_copy(update={"arm_memory": arm_memory}))
-        for arm_memory in (False, True)
-    )
-    env = make_env(extra_observation=remembering.observation)
-    obs, interception_in = env.reset(), offsets(policy_layout(MORE))["interception_in"].start
-    age, first = np.zeros(6), obs[:, [28, 26]]
-    held = not_held = rallies = 0
-    for action in random_actions(env, 150):
-        # y of the ball's velocity, and its height, as measured at 0, 20 and 40 ms
-        first[age < 3] = obs[age < 3][:, [28, 26]]
-        free = (env.observe_extra()[:, interception_in] > 0.24) & (obs[:, 33] == 1.0)
-        wanted = plain.advice(env, obs)
-        wanted[free, 6] = np.clip(0.22 * first[free, 0], -0.95, 0.95)
-        wanted[free, 5] = np.clip(1.1 / 2.1 + 0.8 * (first[free, 1] - 0.48), -0.95, 0.95)
-
-        np.testing.assert_allclose(remembering.advice(env, obs), wanted, atol=1e-6)
-        held, not_held = held + free.sum(), not_held + (~free).sum()
-        step = env.step(action)
-        obs, ended = step.obs, step.terminated | step.truncated
-        age, rallies = np.where(ended, 0, age + 1), rallies + ended.sum()
-
-    assert min(held, not_held) > 100
-    assert rallies > 6
-
-
-def test_the_memory_is_held_by_roll_and_wrist_from_40_ms_to_0_24_s_before_the_interception():
-    assert MEMORY_JOINTS == [6, 5]
-    assert 0.040 < FIRST_MEASURED < 0.060
-    assert STROKE == 0.24
-
-
-def test_arm_memory_is_refused_for_a_teacher_that_does_not_predict_the_interception(tmp_path):
-    config = write_teacher(tmp_path / "t", observation=PAPER_OBSERVATION)
-
-    with pytest.raises(
-        PolicyError, match=r"observation.prediction is False; allowed with teacher.arm_memory: True"
-    ):
-        teacher_of(PAPER, config.model_copy(update={"arm_memory": True}))
 
 
 def test_without_a_policy_there_is_no_teacher():

@@ -27,11 +27,12 @@ from common.perception.flight_track import (
     SPIN_SIGMA,
     new_tracks,
 )
-from common.physics.constants import AIR_FACTOR, BALL_RADIUS, GRAVITY
-from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_SLOPE, Air, flight_step
+from common.physics.flight import SIMPLE, Air, flight_step
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.table_bounce import table_bounce
 
+GRAVITY = 9.81  # m/s^2
+AIR_FACTOR = 1.204 * np.pi * 0.020**2 / (2 * 0.0027)  # 1/m
 START, FLYING = (1.0, 0.2, 0.3), (-6.0, 1.0, 1.0)
 SPIN_RATIO_PRIOR = (1.2, 0.2)  # [-] mean and sigma of spin / visible spin of mild balls
 NOISE = (0.003, 0.08)  # [m], [m/s] of the profile `standard`
@@ -72,7 +73,7 @@ def spin_found(measured, moments, noise=(0.0, 0.0)) -> np.ndarray:
 
 def least_squares(measured, moments, noise) -> np.ndarray:
     """Return the spin by NumPy's least squares. Its sums along the nominal flight have steps of 0.1 ms."""
-    h, lift, drag = 1e-4, AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS, AIR_FACTOR * SIMPLE_DRAG
+    h, lift, drag = 1e-4, AIR_FACTOR * 1.067 * 0.020, AIR_FACTOR * 0.55
     position, velocity = max(noise[0], 0.001), max(noise[1], 0.02)
     p, v = measured[0, :3].copy(), measured[0, 3:].copy()
     displacement, displacement_sum, slowed, slowed_path = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)

@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from hypothesis import strategies as st
 
-from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS
 from common.physics.vec import Vec
+
+BALL_MASS, BALL_RADIUS = 0.0027, 0.020  # kg, m
+BALL_INERTIA = 7.2e-7  # kg m^2: a thin shell, 2/3 m r^2
 
 
 class Contact(NamedTuple):

@@ -7,11 +7,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS, RUBBERS, Rubber
+from common.physics.constants import RUBBERS, Rubber
 from common.physics.racket_bounce import racket_bounce
 from common.physics.table_bounce import table_bounce
 from common.physics.vec import Vec
 from tests.unit.physics.contacts import (
+    BALL_INERTIA,
+    BALL_MASS,
+    BALL_RADIUS,
     Contact,
     contacts,
     kinetic_energy,

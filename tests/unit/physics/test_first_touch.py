@@ -1,4 +1,4 @@
-"""Flight to the first touch, compared with a slow reference. They share only the constants.
+"""Flight to the first touch, compared with a slow reference. They share no constant.
 
 The reference integrates all balls at once with DOP853 to 1e-10, without any contact. It searches the dense solution in
 steps of 0.25 ms until the ball's surface is inside table, net or floor, and bisects that step along its chord. The
@@ -12,7 +12,6 @@ import numpy.typing as npt
 from scipy.integrate import solve_ivp
 
 from common.physics import touch
-from common.physics.constants import FLOOR_Z, GRID_STEP, NET_HALF_WIDTH, NET_HEIGHT, TABLE_THICKNESS
 from common.physics.flight import SIMPLE, Air
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from tests.unit.physics.contacts import as_vec, mirrored, mirrored_spin
@@ -67,11 +66,9 @@ def box_distance(pos: Array, centre: tuple[float, ...], half: tuple[float, ...])
 
 def gaps(pos: Array) -> Array:
     """Return the distance of the ball's surface from table, net and floor, (..., 3)."""
-    table = box_distance(pos, (0.0, 0.0, -TABLE_THICKNESS / 2), (1.37, 0.7625, TABLE_THICKNESS / 2))
-    net = box_distance(
-        pos, (0.0, 0.0, NET_HEIGHT / 2), (touch.NET_HALF_THICKNESS, NET_HALF_WIDTH, NET_HEIGHT / 2)
-    )
-    return np.stack([table, net, pos[..., 2] - FLOOR_Z], axis=-1) - 0.02
+    table = box_distance(pos, (0.0, 0.0, -0.0125), (1.37, 0.7625, 0.0125))
+    net = box_distance(pos, (0.0, 0.0, 0.07625), (0.003, 0.915, 0.07625))
+    return np.stack([table, net, pos[..., 2] + 0.76], axis=-1) - 0.02
 
 
 def reference_touches(launches: Launches) -> tuple[Array, Array, npt.NDArray[np.int64]]:
@@ -94,8 +91,8 @@ def reference_touches(launches: Launches) -> tuple[Array, Array, npt.NDArray[np.
         new = np.isnan(moment) & ~out & (gaps(pos).min(axis=1) < 0.0)
         moment[new], before[new], after[new] = t - SAMPLE, last[new], pos[new]
         last = pos
-        if sample % round(GRID_STEP / SAMPLE) == 0:  # whether a ball is out of play is checked on the grid
-            out |= (np.abs(pos[:, 0]) > touch.PLAY_X) | (np.abs(pos[:, 1]) > touch.PLAY_Y)
+        if sample % round(0.005 / SAMPLE) == 0:  # whether a ball is out of play is checked on the grid
+            out |= (np.abs(pos[:, 0]) > 3.6) | (np.abs(pos[:, 1]) > 2.3)
     assert np.all(out | ~np.isnan(moment))
     low, high = np.zeros((n, 1)), np.ones((n, 1))
     for _ in range(40):

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.physics.constants import AIR_FACTOR, AIR_VOLUME_FACTOR, BALL_RADIUS, GRAVITY, GRID_STEP
 from common.physics.flight import (
     FULL,
     SIMPLE,
@@ -21,6 +20,10 @@ from common.physics.vec import Vec
 from tests.unit.physics.contacts import mirrored, mirrored_spin, vectors
 
 ORIGIN = (0.0, 0.0, 0.0)
+GRAVITY, GRID_STEP, BALL_RADIUS = 9.81, 0.005, 0.020  # m/s^2, s, m
+# rho A/2m [1/m] and rho V/m [-] with 1.204 kg/m^3 and 2.7 g
+AIR_FACTOR = 1.204 * math.pi * 0.020**2 / (2 * 0.0027)
+AIR_VOLUME_FACTOR = 1.204 * 4 / 3 * math.pi * 0.020**3 / 0.0027
 both_models = pytest.mark.parametrize("model", [SIMPLE, FULL], ids=["simple", "full"])
 factors = st.floats(0.5, 1.5)
 

@@ -8,13 +8,16 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from common.physics import touch
-from common.physics.arm import RACKET_RADIUS, joints_at, racket_motion, racket_pose, speed_bound
-from common.physics.constants import GRAVITY, GRID_STEP
+from common.physics.chain import joints_at, racket_motion, racket_pose, speed_bound
 from common.physics.flight import SIMPLE, Air, flight_step
 from common.physics.fly import RobotPath, fly_step
 from common.physics.vec import Vec
+from common.robot.chain_of import chain_of
 from tests.unit.physics.contacts import as_vec
 
+CHAIN = chain_of("rails")
+
+GRAVITY, GRID_STEP = 9.81, 0.005  # m/s^2, s
 STEPS = 4  # grid steps of a control period of 20 ms
 ROBOT_STEP = 0.0025  # s
 ROBOT_ROWS = round(STEPS * GRID_STEP / ROBOT_STEP) + 1
@@ -52,11 +55,11 @@ def make_impact(
         angle: Of that point about the normal [rad].
         moment: Since the first row [s].
     """
-    centre_vel, _ = racket_motion(q, rates)
+    centre_vel, _ = racket_motion(CHAIN, q, rates)
     swing = np.multiply(rates, min(1.0, 10.0 / max(float(np.linalg.norm(centre_vel)), 1e-9)))
     times = np.arange(ROBOT_ROWS) * ROBOT_STEP - moment
-    pose = racket_pose(q)
-    normal, side, up = (np.array(axis) for axis in pose[1:])
+    pose = racket_pose(CHAIN, q)
+    normal, side, up = (np.array(axis) for axis in pose[1:4])
     aim = pose.centre + radius * (math.cos(angle) * side + math.sin(angle) * up)
     along_face = math.cos(azimuth) * side + math.sin(azimuth) * up
     vel = speed * (math.sin(incidence) * along_face - math.cos(incidence) * normal)
@@ -86,7 +89,7 @@ impacts = st.builds(
     speed=st.floats(5.0, 20.0),
     incidence=st.one_of(st.floats(0.0, 1.4), st.floats(math.pi - 1.4, math.pi)),
     azimuth=turns,
-    radius=st.floats(0.0, 0.95 * RACKET_RADIUS),
+    radius=st.floats(0.0, 0.95 * 0.076),
     angle=turns,
     moment=st.floats(0.010, 0.0195),
 )
@@ -98,7 +101,7 @@ def fly(impact: Impact, trajectory: np.ndarray) -> tuple[Vec, float, int]:
     """Return position, time and touch at the end of the control period or at the first touch."""
     pos, vel = impact.pos, impact.vel
     start = 0.0
-    robot_speed = speed_bound(trajectory, ROBOT_STEP)
+    robot_speed = speed_bound(CHAIN, trajectory, ROBOT_STEP)
     for _ in range(STEPS):
         pos, vel, flown, what, _ = fly_step(
             pos,
@@ -106,7 +109,7 @@ def fly(impact: Impact, trajectory: np.ndarray) -> tuple[Vec, float, int]:
             NO_SPIN,
             GRID_STEP,
             Air(0.0, 0.0, SIMPLE),
-            RobotPath(trajectory, ROBOT_STEP, robot_speed),
+            RobotPath(trajectory, ROBOT_STEP, robot_speed, CHAIN),
             start,
         )
         start += flown
@@ -117,7 +120,7 @@ def fly(impact: Impact, trajectory: np.ndarray) -> tuple[Vec, float, int]:
 
 def robot_gap(impact: Impact, pos: Vec, moment: float) -> float:
     q = joints_at(impact.trajectory, moment, ROBOT_STEP)
-    return min(touch.racket_gap(pos, racket_pose(q))[0], touch.body_gap(pos, q)[0])
+    return min(touch.racket_gap(pos, racket_pose(CHAIN, q))[0], touch.body_gap(pos, CHAIN, q)[0])
 
 
 def starts_free(impact: Impact) -> bool:

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 
-from common.physics.constants import BALL_MASS, BALL_RADIUS
 from common.physics.table_bounce import table_bounce
 from common.physics.vec import Vec
-from tests.unit.physics.contacts import Contact, contacts, slip_of
+from tests.unit.physics.contacts import BALL_MASS, BALL_RADIUS, Contact, contacts, slip_of
 
 UP = (0.0, 0.0, 1.0)
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from common.physics.arm import point_velocity, racket_motion, racket_pose
-from common.physics.constants import BALL_RADIUS, NET_HEIGHT, Rubber
+from common.physics.chain import point_velocity, racket_motion, racket_pose
+from common.physics.constants import Rubber
 from common.physics.flight import SIMPLE, Air, flight_step
 from common.physics.racket_bounce import racket_bounce
 from common.physics.touch import racket_gap
@@ -24,20 +24,27 @@ from common.rally.hit_correction import (
     hit_result,
     write_departure,
 )
+from common.robot.chain_of import chain_of
 from common.task.randomization import PROFILES, RALLY_PARAMETERS, air_of, draw_parameters, rubber_of
 from tests.unit.rally.scripted import HOME
 
+CHAIN = chain_of("rails")
+
 SUBSTEPS, H = 5, 0.004
-# inertia, k_p, k_v, joint damping, half-range: similar to the robot's
+BALL_RADIUS, NET_HEIGHT = 0.020, 0.1525  # m
+# inertia, k_p, k_v, half-range, slope of force and speed at the voltage limit: similar to the robot's
 DRIVES = np.array(
     [
         [12.0, 10.0, 0.5, 0.4, 0.2, 0.02, 0.001],
         [8000.0, 5000.0, 200.0, 500.0, 200.0, 80.0, 40.0],
         [600.0, 400.0, 8.0, 20.0, 8.0, 3.0, 1.5],
-        [60.0, 90.0, 1.6, 1.6, 0.8, 0.4, 0.2],
         [0.5, 0.9, 2.9, 1.7, 2.4, 2.1, 2.9],
+        [800.0, 600.0, 10.0, 10.0, 5.0, 2.6, 1.3],
     ]
 )
+
+
+FRICTION = np.array([60.0, 90.0, 1.6, 1.6, 0.8, 0.4, 0.2])
 
 
 def make_parameters(seed=0) -> np.ndarray:
@@ -52,7 +59,7 @@ def make_hit(seed=0, step=30, off=0.0) -> np.ndarray:
     q = np.array(HOME) + 0.05 * rng.uniform(-1, 1, 7)
     q[5] -= 0.15  # the face points up a little
     rates = np.array([1.5, 0.2, 0.3, 1.0, 1.0, 2.0, 0.5]) * rng.uniform(0.5, 1.0, 7)
-    pose = racket_pose(tuple(q))
+    pose = racket_pose(CHAIN, tuple(q))
     place = 0.03 * rng.uniform(-1, 1, 2)
     hit = np.zeros(HIT)
     hit[BALL_POS : BALL_POS + 3] = (
@@ -78,7 +85,7 @@ def leave(hit, parameters) -> None:
 
 def result_of(hit, parameters) -> np.ndarray:
     parts = [tuple(hit[a:b]) for a, b in ((9, 16), (16, 23), (0, 3), (3, 6), (6, 9))]
-    return np.array(hit_result(*parts, rubber_of(parameters), air_of(parameters, SIMPLE)))
+    return np.array(hit_result(CHAIN, *parts, rubber_of(parameters), air_of(parameters, SIMPLE)))
 
 
 def bounced(hit, parameters) -> tuple:
@@ -89,12 +96,12 @@ def bounced(hit, parameters) -> tuple:
     low, high = -0.003, 0.003
     for _ in range(60):
         middle = 0.5 * (low + high)
-        gap, _ = racket_gap(tuple(pos + middle * vel), racket_pose(tuple(q + middle * np.array(qd))))
+        gap, _ = racket_gap(tuple(pos + middle * vel), racket_pose(CHAIN, tuple(q + middle * np.array(qd))))
         low, high = (middle, high) if gap > 0 else (low, middle)
     q, pos = q + low * np.array(qd), pos + low * vel
-    pose = racket_pose(tuple(q))
+    pose = racket_pose(CHAIN, tuple(q))
     _, normal = racket_gap(tuple(pos), pose)
-    racket_vel, racket_spin = racket_motion(tuple(q), qd)
+    racket_vel, racket_spin = racket_motion(CHAIN, tuple(q), qd)
     surface_vel = point_velocity(
         pose.centre, racket_vel, racket_spin, tuple(pos - BALL_RADIUS * np.array(normal))
     )
@@ -122,5 +129,6 @@ def flown(hit, parameters) -> np.ndarray:
 def history_of(limited=None, newest=3, steps=BACK, late=0) -> DriveHistory:
     """Return the history of drives ``DRIVES``; without ``limited`` no drive was ever at its force limit."""
     if limited is None:
-        limited = np.zeros((BACK, SUBSTEPS, 7), np.bool_)
-    return DriveHistory(limited, newest, steps, late, DRIVES, H)
+        limited = np.zeros((BACK, SUBSTEPS, 7), np.int8)
+    losses = np.broadcast_to(FRICTION, (BACK, SUBSTEPS, 7)).astype(np.float32)
+    return DriveHistory(np.asarray(limited, np.int8), losses, newest, steps, late, DRIVES, H)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from common.physics.flight import SIMPLE
 from common.rally.state import Rallies, RobotMotion, Rules, Step, allocate
 from common.rally.step import launch_rallies, play_step
+from common.robot.chain_of import chain_of
 from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
 from common.task.reward import PAPER_REWARD, RewardConfig, reward_table
 from common.task.states import Outcome, State, transition_table
@@ -60,6 +61,7 @@ def make_rules(
         grid_steps=4,
         time_limit=time_limit,
         flight_model=SIMPLE,
+        chain=chain_of("rails"),
     )
 
 

@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from common.rally.hit_correction import BACK, back_through_drives
-from tests.unit.rally.hits import DRIVES, SUBSTEPS, H, history_of
+from tests.unit.rally.hits import DRIVES, FRICTION, SUBSTEPS, H, history_of
 
 
 def driven(targets, joint, limited, late, moment, held=0.0) -> tuple[float, float]:
     """Return a joint's position and velocity at ``moment`` of the last control step; targets (steps,) in [-1, 1].
 
-    A drive at its force limit pushes with a constant force. Its target has no effect.
+    A drive at its force limit (1) pushes with a constant force, one at its voltage limit (2) with one that falls with
+    the speed. Its target has no effect.
     """
-    inertia, stiffness, damping, friction, half_range = DRIVES[:, joint]
+    inertia, stiffness, damping, half_range, back_emf = DRIVES[:, joint]
+    friction = FRICTION[joint]
     given = np.repeat(targets, SUBSTEPS) * half_range
     acting = np.concatenate([np.full(late, held), given])
     q, v = 0.1, -0.3
@@ -20,7 +22,8 @@ def driven(targets, joint, limited, late, moment, held=0.0) -> tuple[float, floa
     for n in range((len(targets) - 1) * SUBSTEPS + last + 1):
         before = q
         if limited[n]:
-            v = (inertia * v + H * 2.0) / (inertia + H * friction)
+            falling = back_emf if limited[n] == 2 else 0.0
+            v = (inertia * v + H * 2.0) / (inertia + H * (friction + falling))
         else:
             v = (inertia * v + H * stiffness * (acting[n] - q)) / (inertia + H * (friction + damping))
         q += H * v
@@ -36,7 +39,8 @@ def test_the_recursion_back_through_the_drives_is_the_derivative_of_their_simula
     """Also for a latency that is longer than a control step."""
     rng = np.random.default_rng(0)
     targets = rng.uniform(-1, 1, (BACK, 7))
-    limited = rng.uniform(size=(BACK, SUBSTEPS, 7)) < limited_share
+    is_limited = rng.uniform(size=(BACK, SUBSTEPS, 7)) < limited_share
+    limited = np.where(is_limited, rng.integers(1, 3, (BACK, SUBSTEPS, 7)), 0)
     by_pos, by_vel, newest = rng.normal(size=7), rng.normal(size=7), 4
     ring = np.roll(limited, newest + 1, axis=0)
     out = np.empty((BACK, 7))
@@ -61,8 +65,8 @@ def test_the_recursion_back_through_the_drives_is_the_derivative_of_their_simula
 
 
 def test_a_drive_at_its_force_limit_does_not_depend_on_its_target():
-    limited = np.zeros((BACK, SUBSTEPS, 7), np.bool_)
-    limited[:, :, 2] = True
+    limited = np.zeros((BACK, SUBSTEPS, 7), np.int8)
+    limited[:, :, 2] = 1
     out = np.empty((BACK, 7))
     back_through_drives(np.ones(7), np.ones(7), 0.0133, history_of(limited, newest=0), out)
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from common.physics.constants import TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 from common.physics.flight import SIMPLE
 from common.rally.hit_correction import (
     BACK,
@@ -12,7 +11,6 @@ from common.rally.hit_correction import (
     BALL_VEL,
     BOUNCE,
     CONTACT,
-    EDGE,
     FRESH,
     GOALS,
     JOINT_POS,
@@ -25,17 +23,20 @@ from common.rally.hit_correction import (
     LEVENBERG,
     MARGIN,
     MOMENT,
-    NEAREST,
     SOONEST,
     TRUST,
+    DriveHistories,
     back_through_drives,
     corrections,
     hit_sensitivity,
     least_change,
 )
+from common.robot.chain_of import chain_of
 from common.task.landing_point import landing_and_clearance
 from common.task.randomization import RallyParameter, air_of, rubber_of
-from tests.unit.rally.hits import DRIVES, SUBSTEPS, H, history_of, leave, make_hit, make_parameters
+from tests.unit.rally.hits import DRIVES, FRICTION, SUBSTEPS, H, history_of, leave, make_hit, make_parameters
+
+CHAIN = chain_of("rails")
 
 
 @pytest.mark.parametrize("met", [[], [4], [4, 5]])
@@ -77,8 +78,9 @@ def corrected(hits, parameters=None) -> tuple[np.ndarray, np.ndarray]:
     if parameters is None:
         parameters = np.array([make_parameters(b) for b in range(count)])
     out, steps = np.full((count, BACK, 7), 7.0), np.full(count, -1)
-    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.bool_)
-    corrections(hits, parameters, SIMPLE, limited, 3, DRIVES, H, out, steps)
+    limited = np.zeros((count, BACK, SUBSTEPS, 7), np.int8)
+    losses = np.broadcast_to(FRICTION, limited.shape).astype(np.float32)
+    corrections(CHAIN, hits, parameters, SIMPLE, DriveHistories(limited, losses, 3, DRIVES, H), out, steps)
     return out, steps
 
 
@@ -151,7 +153,7 @@ def test_only_a_contact_too_soon_after_the_bounce_is_delayed():
     soon[CONTACT] = soon[BOUNCE] + SOONEST - 0.02
     (unchanged, delayed), _ = corrected(np.array([late, soon]), np.array([parameters, parameters]))
     by_pos, by_vel, later = np.empty((GOALS, 7)), np.empty((GOALS, 7)), np.empty((BACK, 7))
-    hit_sensitivity(soon, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel)
+    hit_sensitivity(CHAIN, soon, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel)
     back_through_drives(by_pos[5], by_vel[5], soon[MOMENT], history_of(), later)
 
     assert (later * delayed).sum() > 0.0
@@ -166,15 +168,15 @@ def test_the_goals_are_target_racket_centre_and_height_over_the_net_if_too_low(s
     leave(hit, parameters)
     by_pos, by_vel, changes = np.empty((GOALS, 7)), np.empty((GOALS, 7)), np.empty((GOALS, BACK, 7))
     x, y, side, up, over, _ = hit_sensitivity(
-        hit, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel
+        CHAIN, hit, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel
     )
     history = history_of(late=round(parameters[RallyParameter.ACTION_LATENCY] / H))
     for goal in range(GOALS):
         back_through_drives(by_pos[goal], by_vel[goal], hit[MOMENT], history, changes[goal])
     target = np.clip(
         parameters[[RallyParameter.TARGET_X, RallyParameter.TARGET_Y]],
-        [NEAREST, EDGE - TABLE_HALF_WIDTH],
-        [TABLE_HALF_LENGTH - EDGE, TABLE_HALF_WIDTH - EDGE],
+        [0.40, 0.30 - 0.7625],
+        [1.37 - 0.30, 0.7625 - 0.30],
     )
     miss = target - [x, y]
     miss *= min(1.0, LARGEST_MISS / np.linalg.norm(miss))

@@ -5,8 +5,11 @@ import pytest
 
 from common.physics.flight import SIMPLE
 from common.rally.hit_correction import GOALS, JOINT_POS, JOINT_VEL, PACE, PLACE_WEIGHT, hit_sensitivity
+from common.robot.chain_of import chain_of
 from common.task.randomization import air_of, rubber_of
 from tests.unit.rally.hits import flown, make_hit, make_parameters, result_of
+
+CHAIN = chain_of("rails")
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -31,7 +34,7 @@ def test_the_contact_is_shifted_to_the_time_at_which_ball_and_racket_meet(seed, 
 def test_the_sensitivities_agree_with_central_differences(seed):
     hit, parameters = make_hit(seed), make_parameters(seed)
     by_pos, by_vel = np.empty((GOALS, 7)), np.empty((GOALS, 7))
-    result = hit_sensitivity(hit, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel)
+    result = hit_sensitivity(CHAIN, hit, rubber_of(parameters), air_of(parameters, SIMPLE), by_pos, by_vel)
     central = np.empty((2, GOALS, 7))
     for which, (column, step) in enumerate(((JOINT_POS, 2e-4), (JOINT_VEL, 2e-3))):
         for joint in range(7):

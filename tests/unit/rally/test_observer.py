@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 
 from common.env.rally_env import RallyEnv
-from common.env.robot import JOINTS, RobotBatch
 from common.perception.camera import DETECTION_BUFFER
 from common.perception.camera_filter import is_guess
 from common.physics.constants import GRID_STEP
 from common.policy.folder import load_policy
 from common.rally.observer import BallSample, Observer
+from common.robot.chain_of import chain_of
+from common.robot.description import describe
 from common.task.config import TaskConfig
 from common.task.launch import draw_rallies
-from common.task.observation import JOINT_RANGES, ObservationConfig, policy_layout, size
+from common.task.observation import ObservationConfig, policy_layout, size
 from common.task.randomization import RallyParameter
 from tests.unit.env.rallies import PLAYED_OUT, Deck, random_actions
+
+CHAIN = chain_of("rails")
 
 POLICIES = Path(__file__).parents[3] / "assets" / "policies"
 
@@ -51,7 +54,7 @@ def test_an_observer_returns_the_simulators_observation(options, perception, lau
     options = ObservationConfig(critic="policy", **options)
     task = TaskConfig(observation=options, perception=perception)
     env = RallyEnv(1, task, Deck(draw_rallies(6, seed=2)), experience=PLAYED_OUT)
-    observer = Observer(options)
+    observer = Observer(options, CHAIN)
     obs, rallies, states = env.reset(), 0, set()
     observer.begin(target_of(env))
     for action in random_actions(env, 160, spread=0.1):
@@ -72,9 +75,9 @@ def test_an_observer_returns_the_simulators_observation(options, perception, lau
 @pytest.mark.parametrize("name", ["default", "paper"])
 def test_a_policy_in_the_box_acts_on_an_observation(name):
     policy = load_policy(POLICIES / name)
-    observer = Observer(policy.contract.task.observation)
+    observer = Observer(policy.contract.task.observation, CHAIN)
     observer.begin((0.7, 0.2))
-    still = np.array([home for _, _, _, home in JOINT_RANGES]), np.zeros(7)
+    still = np.array([joint.home for joint in describe("rails").joint]), np.zeros(7)
     obs = observer.observe(0.02, *still, BallSample((1.0, 0.2, 0.3), (-6.0, 0.5, 1.0), 0, 0.0))
     action = policy.act(obs[None])[0]
 
@@ -85,14 +88,4 @@ def test_a_policy_in_the_box_acts_on_an_observation(name):
 
 def test_a_policy_that_observes_the_true_spin_is_refused():
     with pytest.raises(ValueError, match=r"spin 'true' can't be measured"):
-        Observer(ObservationConfig(spin="true"))
-
-
-def test_the_table_of_joints_has_the_robots_numbers():
-    robot = RobotBatch(1)
-    names, _, half_ranges, homes = zip(*JOINT_RANGES, strict=True)
-
-    assert names == JOINTS
-    np.testing.assert_allclose(half_ranges, robot.half_range)
-    np.testing.assert_allclose(robot.middle, 0.0, atol=1e-12)
-    np.testing.assert_allclose(homes, robot.home)
+        Observer(ObservationConfig(spin="true"), CHAIN)

@@ -69,6 +69,21 @@ def toml(tmp_path):
     return write
 
 
+@pytest.mark.parametrize(
+    ("text", "number"), [("60e6", 60_000_000), ("1.5E3", 1500), ("7", 7), ("1_000", 1000)]
+)
+def test_a_whole_number_may_have_an_exponent(text, number):
+    assert load_learner("--max-lag", text).max_lag == number
+
+
+@pytest.mark.parametrize("text", ["1e-3", "1.5e0", "1e", "1e999999999"])
+def test_a_number_with_an_exponent_that_is_not_whole_is_refused(text):
+    with pytest.raises(
+        ConfigError, match=rf"learner.max_lag = '{text}' \(--max-lag\); allowed: a whole number"
+    ):
+        load_learner("--max-lag", text)
+
+
 def test_without_settings_the_defaults_hold():
     assert load_learner() == Learner()
 

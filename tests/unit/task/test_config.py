@@ -17,6 +17,7 @@ MATCH = MatchConditions(
 def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else():
     task = TaskConfig(
         robot="usst",
+        rubber="long_pips",
         control_rate_hz=100,
         flight="full",
         carry_over=0.25,
@@ -30,6 +31,7 @@ def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else(
     others = TaskConfig.model_fields.keys() - MatchConditions.model_fields.keys()
     assert others == {
         "robot",
+        "rubber",
         "control_rate_hz",
         "flight",
         "carry_over",
@@ -57,7 +59,8 @@ def test_settings_of_an_evaluation_that_are_no_conditions_are_not_taken():
 def test_the_default_task_plays_paper_balls_once_at_50_hz_with_standard_randomization():
     task = TaskConfig()
 
-    assert (task.robot, task.control_rate_hz, task.launch, task.rounds) == ("rails", 50, "paper", 1)
+    assert (task.robot, task.rubber) == ("rails", "inverted")
+    assert (task.control_rate_hz, task.launch, task.rounds) == (50, "paper", 1)
     assert (task.randomization, task.perception, task.flight, task.collision) == (
         "standard",
         "cheap",

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from common.physics.constants import NET_HEIGHT
 from common.physics.flight import SIMPLE, Air, flight_step
 from common.task.landing_point import SHORT_OF_NET, landing_and_clearance, landing_point
 
@@ -16,7 +15,7 @@ def test_the_landing_point_is_that_of_a_flight_in_small_steps():
         before = p
         p, v = flight_step(p, v, spin, 1e-4, AIR)
         if before[0] < 0 <= p[0]:
-            over = p[2] - NET_HEIGHT - 0.020
+            over = p[2] - 0.1525 - 0.020
 
     np.testing.assert_allclose(landing_point(pos, vel, spin, AIR), (p[0], p[1], over), atol=1e-3)
 

@@ -6,10 +6,11 @@ import pytest
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import RallyEnv
 from common.perception.flight_track import INTERCEPTION, PRESENT, SPIN
-from common.physics.arm import racket_motion, racket_pose
+from common.physics.chain import racket_motion, racket_pose
 from common.physics.constants import GRID_STEP
 from common.rally.observe import observation_flags, observe
 from common.rally.step import play_step
+from common.robot.chain_of import chain_of
 from common.task.config import TaskConfig
 from common.task.observation import (
     ACTION,
@@ -26,6 +27,8 @@ from common.task.randomization import PROFILES
 from common.task.states import State
 from tests.unit.rally.scripted import HOME, begin, make_launch, make_motion, make_rules
 
+CHAIN = chain_of("rails")
+
 AT = offsets(OBSERVATION)
 LAUNCH = make_launch((0.7, 0.2, 0.6), (-1, 0.5, 0.1), (10, 20, 30))
 
@@ -41,6 +44,7 @@ def observed(joints=HOME, rates=(0.0,) * 7, state: State = State.TAU_01, launch=
         np.array([0]),
         np.array([joints]),
         np.array([rates]),
+        CHAIN,
         flags=observation_flags(PAPER_OBSERVATION),
         out=out,
     )
@@ -76,8 +80,8 @@ def test_joints_and_racket_are_those_of_the_robot():
 
     np.testing.assert_allclose(obs[AT["joint_pos"]], joints, rtol=1e-6)
     np.testing.assert_allclose(obs[AT["joint_vel"]], rates, rtol=1e-6)
-    np.testing.assert_allclose(obs[AT["racket_pos"]], racket_pose(joints).centre, rtol=1e-6)
-    np.testing.assert_allclose(obs[AT["racket_vel"]], racket_motion(joints, rates)[0], rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["racket_pos"]], racket_pose(CHAIN, joints).centre, rtol=1e-6)
+    np.testing.assert_allclose(obs[AT["racket_vel"]], racket_motion(CHAIN, joints, rates)[0], rtol=1e-6)
 
 
 def test_ball_and_target_are_in_their_parts_of_the_layout():

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 
-from common.physics.arm import racket_pose
+from common.physics.chain import racket_pose
 from common.rally.step import play_step
+from common.robot.chain_of import chain_of
 from common.task.randomization import PROFILES
 from common.task.reward import FEATURES, TERMS, R, RewardConfig, reward_table
 from common.task.states import Outcome, State
 from tests.unit.rally.scripted import AWAY, HOME, begin, make_launch, make_motion, make_rules, play_ball
+
+CHAIN = chain_of("rails")
 
 # The paper's matrix as it is printed, with leading zeros: rows tau_0 .. tau_30, columns stage 1 .. 3
 PRINTED = """
@@ -80,7 +83,7 @@ def test_the_matrix_has_an_entry_for_every_state_stage_and_feature():
 def test_the_approach_is_paid_by_the_distance_of_racket_and_ball(stage, weight):
     """The ball falls for 20 ms at 1 m/s and the racket is at home: d_rb follows from their coordinates."""
     ball = np.array([0.7 - 0.02, 0.0, 0.6 - 9.81 / 2 * 0.02**2])
-    d_rb = np.linalg.norm(ball - racket_pose(HOME).centre)
+    d_rb = np.linalg.norm(ball - racket_pose(CHAIN, HOME).centre)
 
     assert pay(stage)["catch_approach"] == pytest.approx(weight / (1 + d_rb**2) ** 2)
 

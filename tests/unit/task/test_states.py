@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
-from common.physics.arm import racket_pose
+from common.physics.chain import racket_pose
 from common.physics.touch import Touch
+from common.rally.state import Rallies
 from common.rally.step import play_step
+from common.robot.chain_of import chain_of
 from common.task.randomization import PROFILES
 from common.task.states import (
     CONTINUES_AS,
@@ -27,8 +29,10 @@ from tests.unit.rally.scripted import (
     play_ball,
 )
 
+CHAIN = chain_of("rails")
+
 FACE_UP = (0.0, 0.0, 0.0, 0.3, 0.6, np.pi / 2 - 0.9, 0.0)
-FACE_UP_CENTRE = racket_pose(FACE_UP).centre
+FACE_UP_CENTRE = racket_pose(CHAIN, FACE_UP).centre
 
 
 def forward(speed: float, moment: float) -> dict[str, tuple[float, ...]]:
@@ -117,7 +121,16 @@ def test_a_legal_racket_contact_counts_as_caught(outcome):
 
 
 @pytest.mark.parametrize(
-    "outcome", [Outcome.VOLLEY, Outcome.DOUBLE_BOUNCE, Outcome.MISS, Outcome.BODY], ids=lambda o: o.name
+    "outcome",
+    [
+        Outcome.VOLLEY,
+        Outcome.DOUBLE_BOUNCE,
+        Outcome.MISS,
+        Outcome.BODY,
+        Outcome.BAD_LAUNCH,  # these two balls are on the opponent's side
+        Outcome.TIME_OUT,
+    ],
+    ids=lambda o: o.name,
 )
 def test_without_a_legal_racket_contact_a_ball_is_neither_caught_nor_over(outcome):
     played = SCRIPTS[outcome]()
@@ -168,14 +181,47 @@ def test_a_landed_ball_is_returned_even_if_the_time_limit_comes_before_its_next_
     assert step.outcome[0] == Outcome.RETURNED
 
 
-def test_a_graze_without_approach_is_no_contact():
-    """A racket that moves away faster than the ball is not hit, even if the gap is zero."""
+def test_a_racket_that_moves_away_faster_than_the_ball_does_not_touch_it():
     played = play_ball(
         (-1.03, 0, 0.23), (-2, 0, 0.5), state=State.TAU_12, joints=HOME, rates=(-6, *[0.0] * 6), steps=3
     )
 
     assert played.outcome == Outcome.NONE
     assert not played.caught
+
+
+def touched_by_a_racket_that_starts_to_move(ball_speed: float) -> Rallies:
+    """Play 5 ms in which the racket is at rest for 10 us, and then moves at 10 m/s towards a ball 1 mm inside it.
+
+    The search for a touch looks 20 us ahead and finds a gap that closes. At the touch itself the racket is at rest.
+    """
+    centre = racket_pose(CHAIN, HOME).centre
+    inside = centre[0] + 0.0065 + 0.020 - 0.001
+    rallies, step = begin(make_launch((inside, centre[1], centre[2]), (ball_speed, 0, 0)), State.TAU_12)
+    pause = 1e-5
+    joints = np.tile(np.array(HOME), (500, 1))
+    joints[:, 0] += 10.0 * pause * np.arange(500)
+    motion = make_motion(HOME, HOME)._replace(
+        joint_pos=joints[None], torque=np.zeros((1, 500, 7)), contact=np.zeros((1, 500, 4)), step=pause
+    )
+    rules = make_rules()._replace(grid_steps=1)
+    play_step(rallies, motion, np.zeros((1, 7)), rules, PROFILES["off"], step)
+    return rallies
+
+
+def test_a_touch_without_approach_is_no_contact():
+    leaving = touched_by_a_racket_that_starts_to_move(0.5)
+
+    assert leaving.state[0] == State.TAU_12
+    assert not leaving.caught[0]
+    np.testing.assert_array_equal(leaving.ball[0, 3:6], [0.5, 0.0, 0.0])
+
+
+def test_the_same_touch_with_approach_is_a_contact():
+    coming = touched_by_a_racket_that_starts_to_move(-0.5)
+
+    assert coming.caught[0]
+    assert coming.ball[0, 3] > 0.0
 
 
 def test_the_mirror_image_of_a_rally_is_played_as_its_mirror_image():

@@ -4,8 +4,11 @@ from threading import Event
 
 import pytest
 
+from common.robot.chain_of import chain_of
 from common.service.config import ConfigError, HelpRequest
 from topspin.__main__ import COMMANDS, dispatch
+
+CHAIN = chain_of("rails")
 
 NEVER = Event()
 
@@ -54,7 +57,7 @@ def test_importing_topspin_registers_the_environments_and_offers_policies():
 
     assert "topspin/Rally-v0" in gymnasium.registry
     policy = topspin.load_policy("paper")
-    observer = topspin.Observer(policy.contract.task.observation)
+    observer = topspin.Observer(policy.contract.task)
     observer.begin((0.9, -0.3))
     ball = topspin.BallSample((0.5, 0.0, 0.3), (-5.0, 0.0, 0.0), 0, 0.0)
     obs = observer.observe(0.02, [0.0] * 7, [0.0] * 7, ball)

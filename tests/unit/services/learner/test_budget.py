@@ -20,6 +20,7 @@ def test_the_limit_that_is_reached_is_named(trained, spent):
 def test_a_limit_of_0_is_no_limit_but_a_curriculum_ends():
     assert Budget(datasets=100, frames=0, minutes=0.0).spent(99, 10**9, 1e9) == ""
     assert Budget(datasets=0, frames=0, minutes=0.0).spent(0, 0, 0.0) == "0 of 0 datasets"
+    assert Budget(datasets=None, frames=0, minutes=0.0).spent(10**9, 10**9, 1e9) == ""
 
 
 def test_minutes_count_as_spent_within_the_slack():

@@ -1,32 +1,83 @@
 import math
 
 import pytest
+from pydantic import ValidationError
 
-from services.learner.curriculum import CurriculumConfig, learning_rate_bound, next_stage
+from services.learner.curriculum import CurriculumConfig, StageLengths, Trained
 
 CONFIG = CurriculumConfig(stage_1=3, stage_2=2, stage_3=10)
+SHARES = CurriculumConfig(stage_shares=(0.14, 0.48, 0.38))
 
 
-def stages(config, epochs, catch=math.nan):
-    stage, inside, seen = config.first_stage, 0, []
-    for _ in range(epochs):
-        seen.append(stage)
-        following = next_stage(stage, inside + 1, catch, config)
-        inside = inside + 1 if following == stage else 0
-        stage = following
+def stages(config, epochs, frames=0, size=100, catch=math.nan):
+    """Return the stage of each epoch, with datasets of ``size`` frames."""
+    lengths, trained, seen = StageLengths(config, frames), Trained(config.first_stage, 0, 0, 0), []
+    for epoch in range(1, epochs + 1):
+        seen.append(trained.stage)
+        trained = Trained(trained.stage, trained.epochs_in_stage + 1, epoch, epoch * size)
+        following = lengths.next_stage(trained, catch)
+        inside = trained.epochs_in_stage if following == trained.stage else 0
+        trained = Trained(following, inside, epoch, epoch * size)
     return seen
+
+
+def in_stage(stage, epochs_in_stage=1, frames=0, epochs=0):
+    return Trained(stage, epochs_in_stage, epochs, frames)
 
 
 def test_each_stage_lasts_its_number_of_epochs():
     assert stages(CONFIG, 8) == [1, 1, 1, 2, 2, 3, 3, 3]
 
 
-def test_a_gate_ends_stage_1_early_once_enough_is_caught():
-    config = CONFIG.model_copy(update={"catch_gate": 0.9})
+def test_a_stage_2_without_epochs_is_left_out():
+    assert stages(CONFIG.model_copy(update={"stage_2": 0}), 5) == [1, 1, 1, 3, 3]
 
-    assert next_stage(1, 1, 0.89, config) == 1
-    assert next_stage(1, 1, 0.9, config) == 2
-    assert next_stage(1, 1, math.nan, config) == 1
+
+@pytest.mark.parametrize("size", [1, 10, 20, 50])
+def test_each_stage_lasts_its_share_of_the_frames_whatever_the_size_of_a_dataset(size):
+    seen = stages(SHARES, 10_000 // size, frames=10_000, size=size)
+
+    for stage, frames in ((1, 1400), (2, 4800), (3, 3800)):
+        assert abs(seen.count(stage) * size - frames) < size  # a stage ends with a dataset
+
+
+def test_stages_before_the_first_one_give_their_share_to_the_others():
+    config = SHARES.model_copy(update={"first_stage": 2})
+
+    assert StageLengths(config, 860).ends() == pytest.approx((0, 480, 860))
+    assert set(stages(SHARES.model_copy(update={"first_stage": 3}), 10, 1000)) == {3}
+
+
+def test_a_share_of_0_leaves_stage_2_out():
+    config = CurriculumConfig(stage_shares=(0.25, 0.0, 0.75))
+
+    assert stages(config, 8, frames=800) == [1, 1, 3, 3, 3, 3, 3, 3]
+
+
+@pytest.mark.parametrize("shares", [(0.5, 0.5), (0.5, 0.6, 0.1), (-0.1, 0.6, 0.5)])
+def test_shares_that_are_not_three_parts_of_one_are_refused(shares):
+    with pytest.raises(ValidationError, match="allowed: empty, or three numbers from 0 that sum to 1"):
+        CurriculumConfig(stage_shares=shares)
+
+
+def test_the_last_stage_needs_a_share():
+    with pytest.raises(ValidationError, match=r"stage_shares with 0 for stage 3; allowed: above 0"):
+        CurriculumConfig(stage_shares=(0.5, 0.5, 0.0))
+
+
+def test_shares_need_a_number_of_frames():
+    SHARES.check_budget(1000)
+    CONFIG.check_budget(0)
+    with pytest.raises(ValueError, match="stage_shares without frames; allowed: frames above 0"):
+        SHARES.check_budget(0)
+
+
+def test_a_gate_ends_stage_1_early_once_enough_is_caught():
+    lengths = StageLengths(CONFIG.model_copy(update={"catch_gate": 0.9}))
+
+    assert lengths.next_stage(in_stage(1), 0.89) == 1
+    assert lengths.next_stage(in_stage(1), 0.9) == 2
+    assert lengths.next_stage(in_stage(1), math.nan) == 1
 
 
 def test_the_curriculum_can_be_skipped():
@@ -36,9 +87,36 @@ def test_the_curriculum_can_be_skipped():
     assert config.epochs == 10
 
 
+def test_the_datasets_that_a_stage_still_takes_are_counted_ahead():
+    lengths, shared = StageLengths(CONFIG), StageLengths(SHARES, 1000)
+
+    assert lengths.datasets_left(in_stage(1, 1, epochs=1)) == 2
+    assert lengths.datasets_left(in_stage(3, 4, epochs=7)) == 8  # with two epochs that a gate saved
+    assert shared.datasets_left(in_stage(1, 0)) == 1  # the size of a dataset is not known yet
+    assert shared.datasets_left(in_stage(1, 1, frames=60, epochs=1)) == 2  # to 140
+    assert shared.datasets_left(in_stage(3, 1, frames=660, epochs=11)) == 6  # to 1000
+
+
 def test_the_learning_rates_bound_falls_in_the_last_stage_only():
-    assert learning_rate_bound(1, 2, 1e-3, 1e-4, CONFIG) == 1e-3
-    assert learning_rate_bound(2, 1, 1e-3, 1e-4, CONFIG) == 1e-3
-    assert learning_rate_bound(3, 0, 1e-3, 1e-4, CONFIG) == 1e-3
-    assert learning_rate_bound(3, 5, 1e-3, 1e-4, CONFIG) == pytest.approx(5.5e-4)
-    assert learning_rate_bound(3, 99, 1e-3, 1e-4, CONFIG) == pytest.approx(1e-4)
+    lengths = StageLengths(CONFIG)
+
+    def bound(stage, epochs):
+        return lengths.learning_rate_bound(in_stage(stage, epochs), 1e-3, 1e-4)
+
+    assert bound(1, 2) == 1e-3
+    assert bound(2, 1) == 1e-3
+    assert bound(3, 0) == 1e-3
+    assert bound(3, 5) == pytest.approx(5.5e-4)
+    assert bound(3, 99) == pytest.approx(1e-4)
+
+
+def test_with_shares_the_learning_rates_bound_falls_with_the_frames_of_the_last_stage():
+    lengths = StageLengths(SHARES, 1000)
+
+    def bound(stage, frames):
+        return lengths.learning_rate_bound(in_stage(stage, frames=frames), 5e-4, 5e-5)
+
+    assert bound(2, 619) == 5e-4
+    assert bound(3, 620) == pytest.approx(5e-4)
+    assert bound(3, 810) == pytest.approx(2.75e-4)
+    assert bound(3, 1000) == pytest.approx(5e-5)

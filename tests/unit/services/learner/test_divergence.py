@@ -55,6 +55,55 @@ def test_what_is_no_divergence(what, rates):
     assert divergence(history(rates), True, LIMITS) == "", what
 
 
+@pytest.mark.parametrize(("rate", "low_epochs"), [(0.39, 1), (0.41, 0), (0.45, 0), (0.79, 0)])
+def test_a_stage_is_low_below_the_share_of_its_own_best(rate, low_epochs):
+    """Best 0.8 and share 0.5: low below 0.4. The rate before is the same, so the running mean stays there."""
+    health = watched(Health(rate=rate, best=0.8), rate, LIMITS)
+
+    assert health.low_epochs == low_epochs
+
+
+@pytest.mark.parametrize(("share", "low_epochs"), [(0.9, 1), (0.6, 0)])
+def test_the_share_decides_what_is_low(share, low_epochs):
+    """A rate of 0.5 after a best of 0.8: 0.72 is above it, 0.48 is not."""
+    config = LIMITS.model_copy(update={"collapse": share})
+
+    assert watched(Health(rate=0.5, best=0.8), 0.5, config).low_epochs == low_epochs
+
+
+@pytest.mark.parametrize(("best", "low_epochs"), [(0.19, 0), (0.21, 1)])
+def test_a_stage_is_checked_once_its_best_has_reached_the_least(best, low_epochs):
+    assert watched(Health(rate=0.01, best=best), 0.01, LIMITS).low_epochs == low_epochs
+
+
+def test_training_has_diverged_after_exactly_the_patience():
+    """The best is 0.8, and 5 epochs in a row at 0.1 are the patience."""
+    health, found = Health(rate=0.1, best=0.8), []
+    for _ in range(6):
+        health = watched(health, 0.1, LIMITS)
+        found.append(divergence(health, True, LIMITS) != "")
+
+    assert found == [False, False, False, False, True, True]
+
+
+def test_one_epoch_at_the_share_starts_the_patience_again():
+    health = watched(Health(rate=0.5, best=0.8, low_epochs=4), 0.5, LIMITS)
+
+    assert health.low_epochs == 0
+    assert divergence(health, True, LIMITS) == ""
+
+
+def test_the_running_rate_takes_a_fifth_of_each_dataset():
+    assert history([0.5, 1.0]).rate == pytest.approx(0.6)
+    assert history([0.5, 1.0, 0.1]).rate == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("rate", "is_good"), [(0.77, True), (0.75, False)])
+def test_a_good_checkpoint_is_within_5_percent_of_the_best(rate, is_good):
+    """0.95 x 0.8 = 0.76."""
+    assert Health(rate=rate, best=0.8).is_good == is_good
+
+
 def test_parameters_that_are_not_finite_are_a_divergence_at_once():
     assert divergence(Health(), False, LIMITS) == "parameters are not finite"
 

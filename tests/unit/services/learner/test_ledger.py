@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.comms.messages import ActorReport, Refusal, VerdictKind
-from services.learner.ledger import FATES, Account, AccountSnapshot, Fate, Outcome, restored
+from services.learner.ledger import FATES, Account, AccountSnapshot, Fate, Ledger, Outcome, restored
 
 OUTCOMES = (Fate.TRAINED, Fate.TRAINED, Fate.TRAINED, Fate.DROPPED, VerdictKind.TOO_OLD)
 HIGHEST = 2**53
@@ -51,6 +51,14 @@ def test_a_checkpoint_restores_every_outcome():
     assert [again.outcome(sequence) for sequence in range(200)] == truth
     assert again.ledger() == account.ledger()
     assert again.snapshot() == snapshot
+
+
+def test_the_sum_of_two_accounts_adds_every_number():
+    one = Ledger(31, 2, {VerdictKind.TOO_OLD: 3, VerdictKind.BUSY: 1}, 5, 7, 13)
+    other = Ledger(280, 20, {VerdictKind.TOO_OLD: 30}, 50, 70, 110)
+
+    assert one + other == Ledger(311, 22, {VerdictKind.TOO_OLD: 33, VerdictKind.BUSY: 1}, 55, 77, 123)
+    assert (one.balance, other.balance, (one + other).balance) == (0, 0, 0)
 
 
 def test_an_outcome_that_is_final_is_not_overwritten():

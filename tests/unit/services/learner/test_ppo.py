@@ -108,7 +108,6 @@ def make_data(network, count=512, seed=0):
         advantages,
         obs[:, 1].clone(),
         nothing,
-        torch.ones_like(mean),
     )
 
 
@@ -191,26 +190,25 @@ def make_corrections(count=512, share=0.2, seed=0):
     return torch.from_numpy((0.1 * rng.normal(size=(count, 7)) * rows).astype(np.float32))
 
 
-def test_the_correction_loss_is_half_the_weighted_mean_squared_distance_from_the_corrected_actions():
+def test_the_correction_loss_is_half_the_mean_squared_distance_from_the_corrected_actions():
     rng = np.random.default_rng(1)
     mean, mean_prox = (torch.from_numpy(rng.normal(size=(50, 7))) for _ in range(2))
-    says = torch.from_numpy(rng.uniform(size=(50, 7)))
     corrections = make_corrections(50).double()
     total = 0.0
     for row in range(50):
         if any(corrections[row, joint] != 0 for joint in range(7)):
             for joint in range(7):
                 wanted = mean_prox[row, joint] + corrections[row, joint]
-                total += 0.5 * float(says[row, joint]) * float(mean[row, joint] - wanted) ** 2
+                total += 0.5 * float(mean[row, joint] - wanted) ** 2
 
     assert 0 < int((corrections != 0).any(-1).sum()) < 50
-    assert float(correction_loss(mean, mean_prox, corrections, says)) == pytest.approx(total / 50)
+    assert float(correction_loss(mean, mean_prox, corrections)) == pytest.approx(total / 50)
 
 
 def test_rows_without_correction_have_no_gradient():
     mean = torch.randn(50, 7, generator=torch.Generator().manual_seed(0)).requires_grad_()
     corrections = make_corrections(50)
-    correction_loss(mean, torch.zeros(50, 7), corrections, torch.ones(50, 7)).backward()
+    correction_loss(mean, torch.zeros(50, 7), corrections).backward()
     silent = (corrections == 0).all(-1)
 
     assert mean.grad is not None

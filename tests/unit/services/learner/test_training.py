@@ -1,3 +1,4 @@
+import copy
 import csv
 import json
 from dataclasses import fields, replace
@@ -12,7 +13,6 @@ from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
 from services.learner.curriculum import CurriculumConfig
-from services.learner.differentiable_arm import ArmModel
 from services.learner.epoch_stats import play_stats
 from services.learner.ppo import PPOConfig
 from services.learner.run_log import RunLog, row
@@ -24,8 +24,10 @@ CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=50)
 EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_seconds=1.5)
 
 
-def make_training(seed=0):
-    return Training(PPO, NetworkConfig(units=(16, 8)), CURRICULUM, np.zeros(7, np.float32), seed)
+def make_training(seed=0, ppo=PPO, curriculum=CURRICULUM, frames=0):
+    return Training(
+        ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), seed, frames=frames
+    )
 
 
 def dataset(epoch):
@@ -92,6 +94,50 @@ def test_a_stage_change_carries_weights_over_and_resets_the_observation_count_al
     assert training.obs_moments.count == 1
     assert training.value_moments.count > values
     assert any(not torch.equal(a, b) for a, b in zip(weights, state(training), strict=True))
+
+
+@pytest.mark.parametrize(("count_reset", "plays_on"), [("absorbed", True), ("raw", False)])
+def test_the_reset_of_the_count_is_absorbed_by_the_network_or_raw(count_reset, plays_on):
+    training = make_training(curriculum=CURRICULUM.model_copy(update={"count_reset": count_reset}))
+    for epoch in range(3):
+        training.run_epoch(dataset(epoch))
+    far = [make_rollout(40)]
+    far[0].obs[...] = 3.0 * far[0].obs + 2.0  # the moments jump to those of the next dataset
+    raw, before = make_rollout(77).obs.reshape(-1, 37), training.obs_moments
+    critic_only = training.read(far)
+    assert before.count == 1
+    network = copy.deepcopy(training.network)
+    training.run_epoch(far)  # refit: the policy's weights do not learn in it
+    played = [
+        n(torch.from_numpy(normalize(0.1 * raw, m)))[0].detach()
+        for n, m in ((network, before), (training.network, training.obs_moments))
+    ]
+
+    assert critic_only.frames == training.obs_moments.count - 1
+    assert training.obs_moments.mean.mean() > 1.5
+    assert torch.allclose(*played, atol=1e-3) == plays_on
+
+
+def test_the_schedule_is_constant_and_then_linear_over_the_last_stage():
+    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_epochs": 0, "target_kl": 1e-6})
+    curriculum = CurriculumConfig(stage_shares=(0.25, 0.25, 0.5))
+    size = 2 * 16 * 8
+    training = make_training(ppo=ppo, curriculum=curriculum, frames=8 * size)
+    stats = [training.run_epoch(dataset(epoch)) for epoch in range(8)]
+    rates = [one.update.learning_rate for one in stats]
+
+    assert [one.progress.stage for one in stats] == [1, 2, 2, 3, 3, 3, 3, 3]
+    assert all(one.update.kl > 2e-6 for one in stats)  # "adaptive" would have divided the rate
+    assert rates[:5] == [5e-4] * 5
+    assert rates[5:] == pytest.approx([5e-4 - k / 4 * (5e-4 - 2e-5) for k in (1, 2, 3)])
+
+
+def test_the_evaluated_weights_are_the_mean_or_the_newest():
+    training = make_training()
+    training.run_epoch(dataset(0))
+
+    assert training.weights("mean") is training.average
+    assert training.weights("newest") is training.network
 
 
 def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
@@ -271,52 +317,6 @@ def test_after_distillation_a_policy_learns_from_rewards_with_small_steps_and_no
     np.testing.assert_array_equal(late.corrections[128:], 1.0)
     assert after.correction_loss == 0.0
     assert after.policy_loss != 0.0
-
-
-def distilling(**teacher):
-    """Return a training with two epochs of distillation, and a rollout with its corrections."""
-    training = make_training()
-    training.teacher = TeacherConfig(policy="somewhere", epochs=2, **teacher)
-    return training, make_rollout(0, corrections=np.ones((16, 8, 7), np.float32))
-
-
-def test_during_distillation_action_noise_can_be_bounded():
-    training, rollout = distilling(max_log_std=-4.0)
-    noises = []
-    for _ in range(3):
-        training.run_epoch([rollout])
-        noises.append(training.network.log_std.detach().clone())
-
-    assert (noises[0] == -4.0).all()
-    assert torch.equal(noises[1], noises[0])
-    assert (noises[2] > -4.01).all()  # PPO's own after that
-
-
-def test_corrections_of_the_arm_memory_have_more_weight_before_the_bounce():
-    training, rollout = distilling(arm_memory=True)
-    rollout.obs[..., 33:37] = 0.0
-    rollout.obs[:8, :, 33] = 1.0  # coming
-    rollout.obs[8:, :, 34] = 1.0  # bounced
-    weights = training.read([rollout]).data.correction_weights.numpy().reshape(16, 8, 7)
-
-    assert (weights[8:] == 1.0).all()
-    assert (weights[:8, :, :5] == 1.0).all()
-    assert (weights[:8, :, 5:] == 4.0).all()
-
-
-def test_gradients_pass_through_the_arm_during_distillation_and_not_from_rollout_to_rollout():
-    training, rollout = distilling()
-    training.arm = ArmModel()
-    motion = training.read([rollout, make_rollout(1, corrections=rollout.corrections)]).data.motion
-    updates = [training.run_epoch([rollout]).update for _ in range(2)]
-
-    assert motion is not None
-    assert [rows.shape for rows in motion.rows] == [(16, 8), (16, 8)]
-    assert motion.rows[0][3, 5] == 3 * 8 + 5
-    np.testing.assert_array_equal(motion.before[3 * 8 + 5], rollout.obs[3, 5, :14])
-    np.testing.assert_array_equal(motion.rows[1] - motion.rows[0], 16 * 8)
-    assert all(stats.finite and stats.correction_loss > 0 for stats in updates)
-    assert training.read([rollout]).data.motion is None  # the teacher's epochs are over
 
 
 @pytest.mark.parametrize("aiming_log_std", [-2.5, -1.0])

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from common.env.robot import RACKET_BODY, load_model
+from common.robot.model import load_model
 from common.task.states import Outcome, State
 from tests.unit.topspin.render.recorded import make_moment, make_rally, make_recorded
 from topspin.render.film import FilmOptions, picture_count, pictures, write_film
@@ -59,8 +59,8 @@ def test_the_drawn_robot_has_the_pose_of_the_trained_one():
             data = mujoco.MjData(model)
             data.qpos[:7] = joints
             mujoco.mj_kinematics(model, data)
-            poses.append(data.body(RACKET_BODY).xmat.copy())
-            poses.append(data.body(RACKET_BODY).xpos.copy())
+            poses.append(data.body("racket").xmat.copy())
+            poses.append(data.body("racket").xpos.copy())
 
         np.testing.assert_allclose(poses[0], poses[2], atol=1e-12)
         np.testing.assert_allclose(poses[1], poses[3], atol=1e-12)

@@ -11,7 +11,6 @@ import pytest
 import tomli_w
 
 from common.errors import ReportedError
-from common.evaluation.measures import measures
 from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, mean_policy, save_policy
@@ -22,28 +21,18 @@ from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import critic_layout, size
 from deploy.config import DeployConfig
-from tests.unit.evaluation.played import MISSED, OUT, RETURNED, make_played
+from tests.unit.topspin.report.runs import make_run
 from topspin import report
 from topspin.report import command
-from topspin.report.collect import Run, RunError, TrainingCurve, read
+from topspin.report.collect import RunError, TrainingCurve, read
 from topspin.report.command import settings
 from topspin.report.config import ReportConfig
 from topspin.report.groups import experiment, group
 from topspin.report.provenance import command as command_of
 from topspin.report.provenance import run_defaults
-from topspin.report.results import GroupResult, Results, RunResult, evaluation_task, inequalities, spread
-from topspin.report.tables import PAPER, Table, headline, markdown
+from topspin.report.results import GroupResult, RunResult, evaluation_task, inequalities
 
 OBSERVATION = TaskConfig().observation
-
-
-def make_run(name="r", missing=(), **settings):
-    return Run(name, {"seed": 0} | settings, None, None, None, tuple(missing))
-
-
-def make_result(run, rows, seed=0):
-    played = make_played(rows)
-    return RunResult(run, seed, "", None, None, played, None, measures(played))
 
 
 def write_run(root: Path, name: str, seed: int = 0, **local):
@@ -157,9 +146,6 @@ def test_groups_are_named_by_their_differences():
             make_run("h", task=observing(ball="filtered")),
             make_run("i", task=observing(ball="filtered", **usual)),
             make_run("j", task=observing(), experience={"teacher": {"policy": "assets/policies/default"}}),
-            make_run(
-                "k", task=observing(), experience={"teacher": {"policy": "default", "arm_memory": True}}
-            ),
         ]
     )
 
@@ -174,7 +160,6 @@ def test_groups_are_named_by_their_differences():
         "stages 1+2+3, 37 numbers, ball filtered",
         "stages 1+2+3, ball filtered",
         "stages 1+2+3, distilled from default, 37 numbers",
-        "stages 1+2+3, distilled from default with arm memory, 37 numbers",
     ]
     assert groups[0].description == (
         "stages 1+2+3, tailored collisions, observes 37 numbers, critic observes the truth"
@@ -227,50 +212,6 @@ def test_a_command_gives_the_settings_it_was_made_from():
     again = load(DeployConfig, found.split()[2:], prog="p", section="local", environ={})
     assert again == config
     assert sorted(found.split()[2:]) == sorted(argv.split())
-
-
-# ---- tables
-
-
-def test_a_table_is_markdown():
-    table = Table("t", ("bin", "rate"), (("a|b", "1 %"), ("ours", "2 %")), frozenset({1}))
-
-    assert markdown(table) == "| bin | rate |\n|---|---:|\n| a\\|b | 1 % |\n| **ours** | 2 % |\n"
-
-
-def test_the_headline_has_the_papers_rows_and_ours_with_spread_and_interval():
-    run = make_run()
-    results = [
-        make_result(run, [RETURNED] * 8 + [OUT, MISSED]),
-        make_result(run, [RETURNED] * 6 + [OUT] * 4, seed=1),
-    ]
-    rows = [RETURNED] * 14 + [OUT] * 5 + [MISSED]
-    names = ("catch_rate", "return_rate", "return_after_catch", "target_error_mean")
-    one = GroupResult(
-        "stages 1+2+3", "", tuple(results), make_played(rows), measures(make_played(rows)),
-        {name: spread(results, name) for name in names}, {}, {},
-    )  # fmt: skip
-    table = headline(Results((one,), ReportConfig(), {}, {}, ()))
-
-    assert table.rows[: len(PAPER)] == PAPER
-    # returned: 0.8 and 0.6, sample deviation 0.1414; 14 of 20; after catch 8/9 and 6/10; 14 of 19
-    assert table.rows[len(PAPER) :] == (
-        (
-            "Topspin, stages 1+2+3 (2 seeds)",
-            "yes",
-            "70.0 ± 14.1 % [48.1, 85.5]",
-            "74.4 ± 20.4 % [51.2, 88.2]",
-            "0.200 ± 0.000 m [0.200, 0.200]",
-        ),
-    )
-
-
-def test_the_papers_rows_name_the_right_works():
-    rows = {row[0]: row[3:] for row in PAPER}
-
-    assert rows["Hu et al. 2025, stages 1+2+3"] == ("90 %", "0.31 m")
-    assert rows["Focused player (Koç et al. 2018)"] == ("–", "0.25 m")
-    assert rows["8dof + GCBC + SSP (GoalsEye, Ding et al. 2022)"] == ("–", "0.84 m")
 
 
 # ---- the command line
@@ -360,7 +301,7 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     assert one["runs"][0]["stage_changes"] == [[2, 2000.0]]
     assert found["missing"] == ["b: no epochs in metrics.csv: frames, hours and stages are unknown"]
     page = (tmp_path / "o" / "report.md").read_text()
-    assert "| **Topspin, stages 1+2+3 (2 seeds)** | yes |" in page
+    assert "| **Topspin, stages 1+2+3 (2 seeds)** | no |" in page
     assert "- b: no epochs in metrics.csv" in page
     assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
     assert "--rounds-too --note note.txt" in page
