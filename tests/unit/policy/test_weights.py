@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,7 +180,8 @@ def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monk
     (tmp_path / "default").mkdir()
 
     assert names() == ["default", "paper"]
-    assert load_policy(policy_folder("default")).contract.run == "default"
+    assert policy_folder("default").resolve() == Path(__file__).parents[3] / "assets" / "policies" / "default"
+    assert load_policy(policy_folder("default")).contract.task.robot == "rails"
     assert policy_folder("./default").resolve() == tmp_path / "default"
     with pytest.raises(
         PolicyError, match="no policy 'nowhere'; allowed: a policy folder, or one of default, paper"
