@@ -13,7 +13,7 @@ from common.rally.hit_correction import CURRENT, FREE, VOLTAGE
 from common.rally.state import RobotMotion
 from common.robot.chain_of import chain_of
 from common.robot.description import RobotDescription, describe
-from common.robot.model import CUBIC_LOSS, LINEAR_LOSS, NO_LOAD, STALL, load_model
+from common.robot.model import CUBIC_LOSS, LINEAR_LOSS, NO_LOAD, STALL, LinkSensors, load_model
 
 log = logging.getLogger(__name__)
 
@@ -117,7 +117,6 @@ class RobotBatch:
         self._control = np.empty((count, self.substeps, 7))
         self._start, self._start_vel = np.empty((count, 7)), np.empty((count, 7))
         self._records: dict[str, Array] = {}
-        self.sensors: Array = np.zeros((count, self.substeps, self.model.nsensordata))
         self.go_home(np.arange(count), np.zeros((count, 7)))
 
     def go_home(self, rows: Rows, offset: Array) -> None:
@@ -183,9 +182,12 @@ class RobotBatch:
         self.faulty = np.flatnonzero(~(np.abs(missing_time) < 0.5 * self.step_s))
         if self.faulty.size:
             self._recover(self.faulty)
-        self.sensors = r["sensordata"]
-        touched = self.sensors[:, :, : len(self.description.links)]
-        return RobotMotion(self._start, r["qpos"], r["actuator_force"], touched, self.step_s)
+        return RobotMotion(self._start, r["qpos"], r["actuator_force"], self.sensors.touch, self.step_s)
+
+    @property
+    def sensors(self) -> LinkSensors:
+        """What the links' sensors measured in the last control step (B, n, ...)."""
+        return LinkSensors.of(self._records["sensordata"], len(self.description.links))
 
     def _advance(self, control: Array) -> dict[str, Array]:
         """Return MuJoCo's records (B, substeps, ...) of a control step under joint targets (B, substeps, 7)."""

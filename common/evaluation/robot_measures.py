@@ -20,7 +20,6 @@ DEEP: Final = 0.002  # [m] self-penetration from which on a rally counts
 STRONG: Final = 50.0  # [N] force on the table from which on a strike counts
 RIM: Final = 0.85  # of the racket's radius: a hit beyond it is on the rim
 _SATURATED: Final = 0.999  # of a drive's force
-_SELF, _TABLE = 4, 3  # numbers of a link's sensors: force and depth; force
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +37,8 @@ class RobotRecord:
         Array  # (n,) distance of the contact from the racket's centre over its radius; nan without one
     )
 
-    def of(self, chosen: npt.NDArray[np.bool_]) -> "RobotRecord":
-        """Return the rallies that ``chosen`` (n,) marks."""
+    def of(self, chosen: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> "RobotRecord":
+        """Return the rallies that ``chosen`` marks (n,) or numbers."""
         return RobotRecord(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
     @classmethod
@@ -65,10 +64,7 @@ class RobotMonitor:
     def update(self, actions: Floats, step: EnvStep) -> None:
         """Record a control step, under ``actions`` (B, 7) as the policy gave them, before they were clipped."""
         now, motion, sensors = self._now, self._env.motion, self._robot.sensors
-        count, links = len(actions), self._links
-        own = sensors[:, :, links : links * (1 + _SELF)].reshape(count, -1, links, _SELF)
-        first = links * (1 + _SELF)
-        table = sensors[:, :, first : first + links * _TABLE].reshape(count, -1, links, _TABLE)
+        own, table = sensors.own, sensors.table
         before = np.concatenate([motion.start_pos[:, None], motion.joint_pos[:, :-1]], axis=1)
         speed = np.abs(motion.joint_pos - before) / (motion.step * self._robot.speed_limit)
         saturated = np.abs(motion.torque) >= _SATURATED * self._robot.torque_limit
@@ -101,10 +97,7 @@ class RobotMonitor:
     def _finish(self, rows: npt.NDArray[np.int64], validated: npt.NDArray[np.bool_]) -> None:
         self._now.saturated[rows] /= self._steps[rows, None]
         self._now.clipped[rows] /= self._steps[rows, None]
-        kept = rows[validated]
-        is_kept = np.zeros(len(self._steps), np.bool_)
-        is_kept[kept] = True
-        self._ended.append(self._now.of(is_kept))
+        self._ended.append(self._now.of(rows[validated]))
         fresh = self._empty(len(rows))
         for field in fields(RobotRecord):
             getattr(self._now, field.name)[rows] = getattr(fresh, field.name)

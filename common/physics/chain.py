@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.jit import inlined, kernel
-from common.physics.vec import Vec, axpy, cross, dot, scale, vec_at
+from common.physics.vec import Vec, axpy, cross, scale, vec_at
 
 Array = npt.NDArray[np.float64]
 Joints = tuple[float, float, float, float, float, float, float]
@@ -261,15 +261,6 @@ def point_velocity(centre: Vec, vel: Vec, angular: Vec, point: Vec) -> Vec:
 
 
 @kernel
-def carried_point(chain: Chain, q: Joints, v: Vec) -> Vec:
-    """Return a point of the frame of the last slide before the first hinge [m], without trigonometry."""
-    frame = world_frame()
-    for joint in range(chain.slides):
-        frame = next_frame(chain, joint, q[joint], frame)
-    return point_of(frame, v)
-
-
-@kernel
 def speed_bound(chain: Chain, trajectory: Array, step: float) -> float:
     """Return an upper bound of the speed [m/s] of all points of the robot along ``trajectory`` (n, 7)."""
     bound = 0.0
@@ -279,11 +270,3 @@ def speed_bound(chain: Chain, trajectory: Array, step: float) -> float:
             distance += abs(trajectory[k + 1, joint] - trajectory[k, joint]) * chain.joints[joint, REACH]
         bound = max(bound, distance / step)
     return bound
-
-
-@kernel
-def is_over_face(pose: RacketPose, point: Vec, share: float) -> bool:
-    """Return whether a point is within a share of the racket's radius from its centre, seen along the normal."""
-    offset = (point[0] - pose.centre[0], point[1] - pose.centre[1], point[2] - pose.centre[2])
-    side, up = dot(offset, pose.side), dot(offset, pose.up)
-    return side * side + up * up <= share * share * pose.radius * pose.radius

@@ -18,9 +18,9 @@ from common.physics.chain import (
     RADIUS,
     START,
     Chain,
+    Frame,
     Joints,
     RacketPose,
-    carried_point,
     next_frame,
     point_of,
     row,
@@ -130,44 +130,32 @@ def racket_gap(pos: Vec, racket: RacketPose) -> tuple[float, Vec]:
 
 
 @inlined
-def _part_gap(pos: Vec, start: Vec, end: Vec, radius: float, gap: float, normal: Vec) -> tuple[float, Vec]:
-    """Return the smaller of a gap and the gap to a capsule, with its normal."""
-    to_part, part_normal = _capsule_gap(pos, start, end, radius)
-    if to_part < gap:
-        return to_part, part_normal
-    return gap, normal
+def _parts_gap(pos: Vec, chain: Chain, q: Joints, joints: int) -> tuple[float, Vec, Frame]:
+    """Return gap and normal of the parts that the first ``joints`` joints move, and the frame of the last of these."""
+    gap, normal = np.inf, (0.0, 0.0, 1.0)
+    parts, frame, part = chain.capsules, world_frame(), 0
+    for joint in range(-1, joints):
+        if joint >= 0:
+            frame = next_frame(chain, joint, q[joint], frame)
+        while part < parts.shape[0] and parts[part, MOVED_BY] == joint:
+            start, end = point_of(frame, row(parts, part, START)), point_of(frame, row(parts, part, END))
+            to_part, part_normal = _capsule_gap(pos, start, end, parts[part, RADIUS])
+            if to_part < gap:
+                gap, normal = to_part, part_normal
+            part += 1
+    return gap, normal, frame
 
 
 @kernel
 def body_gap(pos: Vec, chain: Chain, q: Joints) -> tuple[float, Vec]:
     """Return gap and normal of the robot without its racket's blade."""
-    gap, normal = np.inf, (0.0, 0.0, 1.0)
-    parts = chain.capsules
-    frame = world_frame()
-    part = 0
-    for joint in range(-1, JOINTS):
-        if joint >= 0:
-            frame = next_frame(chain, joint, q[joint], frame)
-        while part < parts.shape[0] and parts[part, MOVED_BY] == joint:
-            start, end = point_of(frame, row(parts, part, START)), point_of(frame, row(parts, part, END))
-            gap, normal = _part_gap(pos, start, end, parts[part, RADIUS], gap, normal)
-            part += 1
+    gap, normal, _ = _parts_gap(pos, chain, q, JOINTS)
     return gap, normal
 
 
 @inlined
 def robot_gap_bound(pos: Vec, chain: Chain, q: Joints) -> float:
     """Return a lower bound [m] of the gap to all parts of the robot, computed without trigonometry."""
-    bound: float = norm(sub(pos, carried_point(chain, q, chain.hub))) - chain.hub_reach - BALL_RADIUS
-    normal = (0.0, 0.0, 1.0)
-    parts = chain.capsules
-    frame = world_frame()
-    part = 0
-    for joint in range(-1, chain.slides):
-        if joint >= 0:
-            frame = next_frame(chain, joint, q[joint], frame)
-        while part < parts.shape[0] and parts[part, MOVED_BY] == joint:
-            start, end = point_of(frame, row(parts, part, START)), point_of(frame, row(parts, part, END))
-            bound, normal = _part_gap(pos, start, end, parts[part, RADIUS], bound, normal)
-            part += 1
-    return bound
+    carried, _, frame = _parts_gap(pos, chain, q, chain.slides)
+    moved = norm(sub(pos, point_of(frame, chain.hub))) - chain.hub_reach - BALL_RADIUS
+    return min(carried, moved)

@@ -52,15 +52,23 @@ def _beyond(
     return farthest
 
 
+def _ball_geoms(model: mujoco.MjModel, racket: str) -> list[int]:
+    """Return the robot's geoms that the ball can hit, without its racket's."""
+    other = (*SURROUNDINGS, racket)
+    return [
+        geom
+        for geom in range(model.ngeom)
+        if model.geom(geom).name not in other and model.geom_group[geom] != _VISUAL
+    ]
+
+
 def _capsules(
     name: str, model: mujoco.MjModel, data: mujoco.MjData, racket: str, owner: dict[int, int]
 ) -> Array:
     """Return the robot's parts that the ball can hit: joint, start, end, radius (n, 8), with all joints at zero."""
     rows = []
-    for geom in range(model.ngeom):
+    for geom in _ball_geoms(model, racket):
         label, kind = model.geom(geom).name, model.geom_type[geom]
-        if label in (*SURROUNDINGS, racket) or model.geom_group[geom] == _VISUAL:
-            continue
         if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
             half = model.geom_size[geom, 1]
         elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -79,22 +87,21 @@ def _capsules(
     return np.array(rows).reshape(-1, 8)
 
 
-def _owners(model: mujoco.MjModel, ids: list[int]) -> dict[int, int]:
+def _owners(model: mujoco.MjModel) -> dict[int, int]:
     """Return for every body the last joint of the chain that moves it; -1: none."""
     owner = {0: -1}
     for body in range(1, model.nbody):
         owner[body] = owner[model.body_parentid[body]]
-        for index, joint in enumerate(ids):
+        for joint in range(JOINTS):
             if model.jnt_bodyid[joint] == body:
-                owner[body] = index
+                owner[body] = joint
     return owner
 
 
 def capsule_names(name: str) -> list[str]:
     """Return the geoms of a robot that the ball can hit, without its racket's."""
     model = load_model(name)
-    labels = [model.geom(geom).name for geom in range(model.ngeom) if model.geom_group[geom] != _VISUAL]
-    return [label for label in labels if label not in (*SURROUNDINGS, describe(name).racket)]
+    return [model.geom(geom).name for geom in _ball_geoms(model, describe(name).racket)]
 
 
 @cache
@@ -112,8 +119,7 @@ def chain_of(name: str) -> Chain:
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     mujoco.mj_kinematics(model, data)
-    ids = list(range(JOINTS))
-    owner = _owners(model, ids)
+    owner = _owners(model)
     axes = [_axis(name, joint, data.xaxis[k]) for k, joint in enumerate(names)]
     is_hinge = model.jnt_type[:JOINTS] == mujoco.mjtJoint.mjJNT_HINGE.value
     anchors = np.array(data.xanchor[:JOINTS])
@@ -130,7 +136,6 @@ def chain_of(name: str) -> Chain:
     rim = float(np.hypot(radius, half))
     points = [[row[0], *row[1:4], row[7]] for row in parts] + [[row[0], *row[4:7], row[7]] for row in parts]
     points.append([JOINTS - 1, *centre, rim])
-    # The racket's handle axis is the last axis at most: its disc reaches as far as its rim around it
     travel = np.abs(np.array([joint.range for joint in robot.joint])).max(axis=1)
     reach = np.ones(JOINTS)
     for k in np.flatnonzero(is_hinge):

@@ -46,7 +46,7 @@ class JointDrive(_Table):
 class RobotDescription(_Table):
     """What a robot's MJCF model does not say."""
 
-    summary: str = Field(description="one line for --help")
+    summary: str = Field(description="one line for the reference")
     model: str = Field("", description="the robot whose MJCF this one uses; empty: its own")
     racket: str = Field("racket", description="the racket's cylinder geom; a site of this name has its frame")
     links: tuple[str, ...] = Field(description="geoms that can strike something, in the order of the sensors")

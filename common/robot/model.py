@@ -9,9 +9,11 @@ The covers of the parts that the arm can strike on the robot itself are soft (AD
 """
 
 import xml.etree.ElementTree as ET
-from typing import Final
+from typing import Final, NamedTuple
 
 import mujoco
+import numpy as np
+import numpy.typing as npt
 
 from common.physics.constants import (
     FLOOR_Z,
@@ -24,6 +26,8 @@ from common.physics.constants import (
 from common.physics.touch import NET_HALF_THICKNESS
 from common.robot.description import JointDrive, RobotDescription, RobotError, describe, model_path
 
+Array = npt.NDArray[np.float64]
+
 STALL: Final = 6.0
 """A motor's torque at a standstill at full voltage, over the drive's force: sets where the voltage begins to limit."""
 NO_LOAD: Final = 0.9  # of the speed limit: the speed at which the motor's torque vanishes
@@ -32,8 +36,25 @@ COVER: Final = 0.030  # [m] thickness of the soft covers
 COVER_SOLREF: Final = "0.012 1"  # time constant [s], three of MuJoCo's longest steps; damping ratio
 COVER_SOLIMP: Final = "0.5 0.95 0.03"  # softest at the surface, stiff at the hard part under it
 SURROUNDINGS: Final = ("table", "net", "floor")
-TOUCH, SELF, TABLE = "touch", "self", "table"
-"""Sensors of each link: force of all contacts; force and depth of the deepest with the robot; force on the table."""
+
+
+class LinkSensors(NamedTuple):
+    """What the links' sensors measured, in the order of MuJoCo's sensor data."""
+
+    touch: Array  # (..., links) [N] force of all contacts
+    own: Array  # (..., links, 4) [N, m] force of the deepest contact with the robot, and its distance
+    table: Array  # (..., links, 3) [N] largest force on the table
+
+    @classmethod
+    def of(cls, data: Array, links: int) -> "LinkSensors":
+        """Return the sensors of ``links`` links from MuJoCo's sensor data (..., n)."""
+        touch, own, table = links, 5 * links, 8 * links
+        lead = data.shape[:-1]
+        return cls(
+            data[..., :touch],
+            data[..., touch:own].reshape(*lead, links, 4),
+            data[..., own:table].reshape(*lead, links, 3),
+        )
 
 
 def _drive(joint: JointDrive) -> ET.Element:
@@ -83,7 +104,7 @@ def _parent_of(root: ET.Element, kind: str, name: str) -> ET.Element:
 
 
 def _sensors(root: ET.Element, robot: RobotDescription) -> ET.Element:
-    """Return the links' sensors, in the order of ``TOUCH``, ``SELF``, ``TABLE``, and add the sites that they need."""
+    """Return the links' sensors, in the order of ``LinkSensors``, and add the sites that they need."""
     bodies = root.find("worldbody")
     base = None if bodies is None else bodies.find("body")
     if base is None:
@@ -93,12 +114,12 @@ def _sensors(root: ET.Element, robot: RobotDescription) -> ET.Element:
         body = _parent_of(root, "geom", link)
         site = ET.Element("site", name=f"{link}_touch", type="sphere", size="1", rgba="0 0 0 0", group="4")
         body.append(site)
-        found.append(ET.Element("touch", name=f"{link}_{TOUCH}", site=f"{link}_touch"))
+        found.append(ET.Element("touch", name=f"{link}_touch", site=f"{link}_touch"))
     for link in robot.links:
         found.append(
             ET.Element(
                 "contact",
-                name=f"{link}_{SELF}",
+                name=f"{link}_self",
                 geom1=link,
                 subtree2=base.get("name", ""),
                 data="force dist",
@@ -108,7 +129,7 @@ def _sensors(root: ET.Element, robot: RobotDescription) -> ET.Element:
     for link in robot.links:
         found.append(
             ET.Element(
-                "contact", name=f"{link}_{TABLE}", geom1=link, geom2="table", data="force", reduce="maxforce"
+                "contact", name=f"{link}_table", geom1=link, geom2="table", data="force", reduce="maxforce"
             )
         )
     return found

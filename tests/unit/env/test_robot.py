@@ -168,14 +168,13 @@ def test_joints_in_coupled_motion_hold_their_speed_limits(name, limits):
 def test_a_link_that_strikes_the_robot_is_stopped_and_felt(name):
     """Targets anywhere drive arm and racket into base, beam and column: the covers hold, and F_c has the force."""
     robot = RobotBatch(64, name)
-    links = len(robot.description.links)
     deepest, felt, struck = 0.0, 0.0, 0.0
     targets = uniform_targets(seed=3)
     if name == "arm":  # only where elbow and wrist fold
         targets[:, :, [3, 5]] = 1.0
     for action in targets:
         motion = robot.step(action)
-        own = robot.sensors[:, :, links : 5 * links].reshape(64, -1, links, 4)
+        own = robot.sensors.own
         deepest = max(deepest, -own[..., 3].min())
         force = np.linalg.norm(own[..., :3], axis=-1)
         felt = max(felt, force.max())
