@@ -20,6 +20,7 @@ KERNEL_ROOMS: Final = (
     "common/physics",
     "common/task",
     "common/perception",
+    "common/policy",
     "common/rally",
     "common/env",
     "common/evaluation",

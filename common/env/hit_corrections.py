@@ -50,7 +50,7 @@ class HitCorrector:
     def update(self, rallies: Rallies, motion: RobotMotion, corrects: bool) -> HitCorrections:
         """Record one control step of all robots, and return the corrections of its hits if ``corrects``."""
         self._newest = (self._newest + 1) % BACK
-        self._limits[:, self._newest], self._losses[:, self._newest] = self._robot.limits(motion)
+        self._robot.record_limits(motion, self._limits[:, self._newest], self._losses[:, self._newest])
         if not corrects:
             return NO_HIT_CORRECTIONS
         corrections(

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
 
+from common.jit import kernel
 from common.physics.chain import JOINTS, Chain
 from common.rally.hit_correction import CURRENT, FREE, VOLTAGE
 from common.rally.state import RobotMotion
@@ -47,6 +48,35 @@ def home_action(name: str = "rails") -> npt.NDArray[np.float32]:
     home = np.array([joint.home for joint in joints])
     action: npt.NDArray[np.float32] = ((home - 0.5 * (low + high)) / (0.5 * (high - low))).astype(np.float32)
     return action
+
+
+@kernel
+def _record_limits(
+    motion: RobotMotion,
+    start_vel: Array,
+    torque_limit: Array,
+    speed_limit: Array,
+    limits: npt.NDArray[np.int8],
+    losses: npt.NDArray[np.float32],
+) -> None:
+    """Write each drive's limit and the slope of its losses (B, n, 7) at the start of each substep.
+
+    MuJoCo computes the force from the speed there.
+    """
+    for b in range(limits.shape[0]):
+        for j in range(JOINTS):
+            at, speed = motion.start_pos[b, j], start_vel[b, j] / speed_limit[j]
+            for k in range(limits.shape[1]):
+                force = motion.torque[b, k, j] / torque_limit[j]
+                by_voltage = STALL * (1.0 - abs(speed) / NO_LOAD)
+                forward = force if speed > 0.0 else -force if speed < 0.0 else 0.0
+                limits[b, k, j] = VOLTAGE if forward >= by_voltage - _AT_VOLTAGE else FREE
+                if abs(force) >= 1.0 - _AT_CURRENT:
+                    limits[b, k, j] = CURRENT
+                slope = LINEAR_LOSS + 3.0 * CUBIC_LOSS * speed * speed
+                losses[b, k, j] = slope * (torque_limit[j] / speed_limit[j])
+                after = motion.joint_pos[b, k, j]
+                at, speed = after, (after - at) / motion.step / speed_limit[j]
 
 
 class RobotBatch:
@@ -139,23 +169,17 @@ class RobotBatch:
         back_emf = STALL / NO_LOAD * self.torque_limit / self.speed_limit
         return np.stack([inertia, self._kp, self._kv, self.half_range, back_emf])
 
-    def limits(self, motion: RobotMotion) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.float32]]:
-        """Return what ``DriveHistory`` keeps of a control step's substeps.
+    def record_limits(
+        self, motion: RobotMotion, limits: npt.NDArray[np.int8], losses: npt.NDArray[np.float32]
+    ) -> None:
+        """Write what ``DriveHistory`` keeps of a control step's substeps.
 
-        Returns:
-            What limited each drive (B, n, 7): ``hit_correction.FREE``, CURRENT or VOLTAGE; and the slope of its losses
-            and its speed (B, n, 7).
+        Args:
+            motion: Of the control step.
+            limits: What limited each drive (B, n, 7): ``hit_correction.FREE``, CURRENT or VOLTAGE; written.
+            losses: Slope of its losses and its speed (B, n, 7); written.
         """
-        force = motion.torque / self.torque_limit
-        path = np.concatenate([motion.start_pos[:, None], motion.joint_pos[:, :-1]], axis=1)
-        # at the start of each substep, where MuJoCo computes the force
-        speed = np.concatenate([self._start_vel[:, None], np.diff(path, axis=1) / motion.step], axis=1)
-        speed /= self.speed_limit
-        by_voltage = STALL * (1.0 - np.abs(speed) / NO_LOAD)
-        limits = np.where(force * np.sign(speed) >= by_voltage - _AT_VOLTAGE, VOLTAGE, FREE).astype(np.int8)
-        limits[np.abs(force) >= 1.0 - _AT_CURRENT] = CURRENT
-        losses = (LINEAR_LOSS + 3.0 * CUBIC_LOSS * speed * speed) * (self.torque_limit / self.speed_limit)
-        return limits, losses.astype(np.float32)
+        _record_limits(motion, self._start_vel, self.torque_limit, self.speed_limit, limits, losses)
 
     def push_racket(self, impulse: Array) -> None:
         """Apply impulses (B, 6) [N s, N m s] at the racket's centre, spread over the next control step."""

@@ -14,6 +14,7 @@ from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
 from common.env.teacher import teacher_of
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.contract import training_hash
+from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import install, new_network
 from common.task.config import TaskConfig
@@ -59,6 +60,7 @@ class Player:
         self.snapshot: PolicySnapshot | None = None
         self._obs_size = size(critic_layout(task.observation))
         self._network = new_network(network, task.observation)  # only its policy is used
+        self._network_pass = NetworkPass(self._network, envs, "float32")
         self._moments = Moments.initial(self._network.obs_size)
         self._noise = torch.Generator()
         self._seed = seed
@@ -70,6 +72,7 @@ class Player:
         """Play ``snapshot`` from the next block on. Raises PolicyError if it does not fit."""
         layout = critic_layout(self.env.task.observation)
         moments = install(self._network, snapshot, layout, self.training_hash, "actor")
+        self._network_pass.refresh()
         self._moments = moments.first(self._network.obs_size)
         if self.snapshot is None or self.snapshot.stage != snapshot.stage:
             self.env.set_stage(snapshot.stage)
@@ -103,7 +106,7 @@ class Player:
             started = self._clock()
             obs[t] = self._obs
             with torch.inference_mode():
-                mean = self._network.act(torch.from_numpy(normalize(self._obs[:, :width], self._moments)))
+                mean = self._network_pass.act(torch.from_numpy(normalize(self._obs[:, :width], self._moments)))
                 noise = torch.randn(mean.shape, generator=self._noise)
                 action = mean + self._network.log_std.exp() * noise
                 log_mu[t] = log_prob(action, mean, self._network.log_std).numpy()

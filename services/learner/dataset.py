@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from common.comms.messages import Rollout
-from common.policy.actor_critic import ActorCritic, log_prob
+from common.policy.actor_critic import log_prob
+from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.advantage import gae
 from services.learner.epoch_stats import PlayStats, play_stats
-from services.learner.ppo import Dataset, PPOConfig, arithmetic, denormalized, explained_variance
+from services.learner.ppo import Dataset, PPOConfig, denormalized, explained_variance
 
 Floats = npt.NDArray[np.float32]
 
@@ -23,7 +24,7 @@ Floats = npt.NDArray[np.float32]
 class Model:
     """The network before its update, with the moments that normalise its inputs and values."""
 
-    network: ActorCritic
+    network_pass: NetworkPass
     obs_moments: Moments
     value_moments: Moments
     obs_size: int
@@ -33,9 +34,8 @@ class Model:
         """Return the critic's values [reward] of observations (N, D)."""
         if len(obs) == 0:
             return np.zeros(0, np.float32)
-        with arithmetic(self.ppo.precision):
-            _, value = self.network(torch.from_numpy(normalize(obs, self.obs_moments)))
-        return denormalized(value.float(), self.value_moments)
+        _, value = self.network_pass.evaluate(torch.from_numpy(normalize(obs, self.obs_moments)))
+        return denormalized(value, self.value_moments)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def read(
         version: Of the policy before the update.
         on_tick: Called between rollouts.
     """
-    log_std = model.network.log_std.detach().clone()
+    log_std = model.network_pass.network.log_std.detach().clone()
     parts = []
     for rollout in rollouts:
         parts.append(_part(rollout, model, distillation, log_std))
@@ -129,10 +129,9 @@ def read(
 def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor) -> _Part:
     ppo, steps, count = model.ppo, *r.rewards.shape
     obs = torch.from_numpy(normalize(r.obs, model.obs_moments).reshape(-1, model.obs_size))
+    obs = obs.to(model.network_pass.dtype)
     actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
-    with arithmetic(ppo.precision):
-        mean, value = model.network(obs)
-    mean, value = mean.float(), value.float()
+    mean, value = model.network_pass.evaluate(obs)
     values = denormalized(value, model.value_moments).reshape(steps, count)
     final = np.zeros(steps * count, np.float32)
     final[r.final_index] = model.values(r.final_obs)

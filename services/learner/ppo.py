@@ -10,8 +10,9 @@ importance weight to mu is clipped from above:
 At lag 0 pi_prox = mu, w = 1: plain PPO.
 """
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import Enum, auto
 from typing import Literal, NamedTuple, Self
 
@@ -21,7 +22,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
-from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
+from common.policy.actor_critic import entropy, kl_divergence, log_prob
+from common.policy.network_pass import NetworkPass, Precision, native_precision
 from common.policy.normalizer import Moments
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
@@ -77,6 +79,11 @@ class PPOConfig(BaseModel):
         0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
     )
 
+    @property
+    def products(self) -> Precision:
+        """Return the precision of matrix products on this machine."""
+        return native_precision() if self.precision == "auto" else self.precision
+
     @model_validator(mode="after")
     def _bounds_are_in_order(self) -> Self:  # the starting rate is clipped to them when it adapts
         if self.learning_rate_min > self.learning_rate_max:
@@ -101,12 +108,18 @@ class Dataset:
     log_mu: Tensor  # (N,) as recorded by the actor
     log_prox: Tensor  # (N,)
     mean_prox: Tensor  # (N, A)
-    log_std_prox: Tensor  # (A,)
     advantages: Tensor  # (N,) normalised
     value_targets: Tensor  # (N,) normalised
-    corrections: (
-        Tensor  # (N, A) target change of the mean action (or the teacher's); rows of zeros: no correction
-    )
+    corrections: Tensor  # (N, A) change of the mean action to aim at (or the teacher's); rows of zeros: none
+    log_std_prox: Tensor  # (A,)
+
+    def __len__(self) -> int:
+        return len(self.obs)
+
+    def taken(self, rows: Tensor | slice) -> Self:
+        """Return some frames; of a slice they are views."""
+        columns = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-1]}
+        return replace(self, **columns)
 
 
 class UpdateMode(Enum):
@@ -146,14 +159,6 @@ class UpdateStats:
     finite: bool  # False: a gradient step was skipped because it was not finite
 
 
-def arithmetic(precision: str) -> torch.autocast:
-    """Return the context in which the network's products are computed in ``precision``."""
-    if precision == "auto":
-        can = torch.cpu.get_capabilities()
-        precision = "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
-    return torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16")
-
-
 def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
     """Return decoupled PPO's clipped surrogate loss (a scalar)."""
     ratio = torch.exp(log_new - log_prox)
@@ -178,11 +183,14 @@ def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
     return 0.5 * ((mean - acted - corrections).square() * is_corrected).sum(-1).mean()
 
 
-def minibatches(count: int, size: int, generator: torch.Generator) -> Iterator[Tensor]:
-    """Yield one pass over ``count`` frames: rows (n,) in random order."""
-    for rows in torch.split(torch.randperm(count, generator=generator), size):
-        if len(rows) >= min(size, count) // 2:  # a small remainder would weigh as much as a full batch
-            yield rows
+def minibatches(data: Dataset, size: int, generator: torch.Generator) -> Iterator[Dataset]:
+    """Yield one pass over a dataset: its frames in random order, ``size`` at a time."""
+    count = len(data)
+    shuffled = data.taken(torch.randperm(count, generator=generator))
+    for start in range(0, count, size):
+        batch = shuffled.taken(slice(start, start + size))
+        if len(batch) >= min(size, count) // 2:  # a small remainder would weigh as much as a full batch
+            yield batch
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -221,44 +229,39 @@ class _Losses:
     bound: Tensor
     correction: Tensor
     total: Tensor
-    mean: Tensor  # (n, A)
     log_new: Tensor  # (n,)
 
 
 def _losses(
-    network: ActorCritic,
-    data: Dataset,
+    mean: Tensor,
+    values: Tensor,
+    log_std: Tensor,
+    batch: Dataset,
     config: PPOConfig,
-    rows: Tensor,
     mode: UpdateMode,
     is_corrected: bool,
 ) -> _Losses:
-    """Return the losses of one minibatch."""
-    with arithmetic(config.precision):
-        mean, values = network(data.obs[rows])
-    mean, values = mean.float(), values.float()
-    log_new = log_prob(data.actions[rows], mean, network.log_std)
+    """Return the losses of one minibatch, given the network's outputs (n, A) and (n,)."""
+    log_new = log_prob(batch.actions, mean, log_std)
     loss_policy = torch.zeros(())
     if mode is UpdateMode.PPO:
-        loss_policy = policy_loss(
-            log_new, data.log_prox[rows], data.log_mu[rows], data.advantages[rows], config.clip
-        )
-    loss_value = 0.5 * (values - data.value_targets[rows]).square().mean()
+        loss_policy = policy_loss(log_new, batch.log_prox, batch.log_mu, batch.advantages, config.clip)
+    loss_value = 0.5 * (values - batch.value_targets).square().mean()
     loss_bound = bound_loss(mean)
     loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
     loss_correction = torch.zeros(())
     if is_corrected:
         # A teacher's correction is relative to the played action, a hit's to the mean action
-        acted = (data.actions if mode is UpdateMode.DISTILL else data.mean_prox)[rows]
-        loss_correction = correction_loss(mean, acted, data.corrections[rows])
+        acted = batch.actions if mode is UpdateMode.DISTILL else batch.mean_prox
+        loss_correction = correction_loss(mean, acted, batch.corrections)
         loss = loss + config.correction_weight * loss_correction
     if config.entropy_weight > 0:
-        loss = loss - config.entropy_weight * entropy(network.log_std)
-    return _Losses(loss_policy, loss_value, loss_bound, loss_correction, loss, mean, log_new)
+        loss = loss - config.entropy_weight * entropy(log_std)
+    return _Losses(loss_policy, loss_value, loss_bound, loss_correction, loss, log_new)
 
 
 def update(
-    network: ActorCritic,
+    network_pass: NetworkPass,
     optimizer: torch.optim.Optimizer,
     data: Dataset,
     config: PPOConfig,
@@ -268,11 +271,11 @@ def update(
     on_tick: Callable[[], None] = lambda: None,
     mode: UpdateMode = UpdateMode.PPO,
 ) -> UpdateStats:
-    """Run the mini-epochs of one epoch. ``network`` and ``optimizer`` are changed in place.
+    """Run the mini-epochs of one epoch. The network and ``optimizer`` are changed in place.
 
     Args:
-        network: Policy and critic.
-        optimizer: Adam over its parameters.
+        network_pass: Of policy and critic, for a minibatch or more.
+        optimizer: Adam over their parameters.
         data: This epoch's dataset.
         config: Hyper-parameters.
         rate: Learning rate at the start, and its upper bound.
@@ -281,10 +284,13 @@ def update(
         on_tick: Called between gradient steps.
         mode: What the policy learns from.
     """
+    network = network_pass.network
     parameters = list(network.parameters())
     learns = mode is not UpdateMode.CRITIC_ONLY
     for parameter in network.policy_parameters():
         parameter.requires_grad_(learns)  # a frozen one has no gradient, so that Adam does not change it
+    data = replace(data, obs=data.obs.to(network_pass.dtype))
+    network_pass.refresh()
     sums = np.zeros(6)
     is_corrected = config.correction_weight > 0 and learns and bool((data.corrections != 0.0).any())
     learning_rate = rate.start
@@ -293,20 +299,23 @@ def update(
         for group in optimizer.param_groups:
             group["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
-        for rows in minibatches(len(data.obs), config.minibatch, generator):
-            losses = _losses(network, data, config, rows, mode, is_corrected)
+        for batch in minibatches(data, config.minibatch, generator):
+            mean, values = network_pass.forward(batch.obs)
+            mean.requires_grad_(learns)
+            values.requires_grad_()
+            losses = _losses(mean, values, network.log_std, batch, config, mode, is_corrected)
             optimizer.zero_grad(set_to_none=True)
             losses.total.backward()  # type: ignore[no-untyped-call]
-            norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm))
+            network_pass.backward(mean.grad, values.grad)
+            norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm, foreach=True))
             if not np.isfinite(norm):
                 finite = False
                 continue
             optimizer.step()
+            network_pass.refresh()
             with torch.no_grad():
-                kl = float(
-                    kl_divergence(data.mean_prox[rows], data.log_std_prox, losses.mean, network.log_std)
-                )
-                outside = ((losses.log_new - data.log_prox[rows]).exp() - 1.0).abs() > config.clip
+                kl = float(kl_divergence(batch.mean_prox, batch.log_std_prox, mean, network.log_std))
+                outside = ((losses.log_new - batch.log_prox).exp() - 1.0).abs() > config.clip
             sums += (
                 losses.policy.item(),
                 losses.value.item(),
@@ -318,7 +327,7 @@ def update(
             on_tick()
             kl_sum += kl
             steps, batches = steps + 1, batches + 1
-        kl = kl_sum / max(batches, 1)
+        kl = kl_sum / batches if batches else math.inf  # no step was finite: smaller ones are needed
         if mode is UpdateMode.PPO and config.schedule == "adaptive":
             learning_rate = adapted_learning_rate(
                 learning_rate, kl, config.learning_rate_min, rate.highest, config.target_kl

@@ -11,6 +11,7 @@ import torch
 
 from common.comms.messages import Rollout
 from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import TeacherConfig
@@ -24,7 +25,10 @@ from services.learner.ppo import LearningRate, PPOConfig, UpdateMode, update
 Floats = npt.NDArray[np.float32]
 
 EvaluatedWeights = Literal["mean", "newest"]
-AVERAGE_DECAY: Final = 0.99  # of the weights' running mean, per dataset: it covers about 0.8 M frames
+AVERAGE_DATASETS: Final = 100  # most datasets that the weights' running mean covers: 0.8 M frames
+# [-] share of the training so far that it covers before that. A longer mean of young weights, which learn fast, plays
+# worse than they do.
+AVERAGE_SHARE: Final = 0.1
 
 
 class Training:
@@ -71,7 +75,10 @@ class Training:
         self.notice = notice
         self.divergence = divergence
         self.teacher = teacher
-        self.optimizer = torch.optim.Adam(self.network.parameters(), lr=ppo.learning_rate, eps=1e-8)
+        self.network_pass = NetworkPass(self.network, ppo.minibatch, ppo.products)
+        self.optimizer = torch.optim.Adam(
+            self.network.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True
+        )
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
@@ -123,7 +130,7 @@ class Training:
             else UpdateMode.PPO
         )
         stats = update(
-            self.network,
+            self.network_pass,
             self.optimizer,
             batch.data,
             ppo,
@@ -180,7 +187,8 @@ class Training:
 
     def read(self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None) -> Batch:
         """Return the data of the next epoch from its rollouts; nothing is changed."""
-        model = Model(self.network, self.obs_moments, self.value_moments, self.obs_size, self.ppo)
+        self.network_pass.refresh()
+        model = Model(self.network_pass, self.obs_moments, self.value_moments, self.obs_size, self.ppo)
         distillation = Distillation(self.teacher, self.is_distilling)
         return read(rollouts, model, distillation, self.progress.version, on_tick)
 
@@ -199,10 +207,10 @@ class Training:
 
     @torch.no_grad()
     def _update_ema(self) -> None:
-        """Update the running mean of the weights. A new mean forgets its start faster."""
-        weight = max(1.0 - AVERAGE_DECAY, 1.0 / (2.0 + self.progress.version))
-        for mean, newest in zip(self.average.parameters(), self.network.parameters(), strict=True):
-            mean.lerp_(newest, weight)
+        """Update the running mean of the weights."""
+        age = self.progress.version + 1
+        weight = 1.0 / min(max(AVERAGE_SHARE * age, 1.0), AVERAGE_DATASETS)
+        torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
 
     def _enter(self, stage: int) -> None:
         """Reset the normaliser's count and cap the action noise, for a new stage."""

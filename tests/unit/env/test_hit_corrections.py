@@ -132,7 +132,9 @@ def drive(actions, late=0.0, rate=50.0) -> tuple[RobotBatch, Driven]:
     limited, slopes = [], []
     for action in actions:
         motion = robot.step(action)
-        limits, losses = robot.limits(motion)
+        limits = np.empty(motion.torque.shape, np.int8)
+        losses = np.empty(motion.torque.shape, np.float32)
+        robot.record_limits(motion, limits, losses)
         limited.append(limits)
         slopes.append(losses)
     moment = MOMENT * 50.0 / rate

@@ -10,8 +10,8 @@ import torch
 
 from common.policy.actor_critic import ActorCritic, NetworkConfig
 from common.policy.weights import new_network
-from services.learner.ppo import Dataset, LearningRate, PPOConfig, UpdateMode, minibatches, update
-from tests.unit.services.learner.test_ppo import make_data
+from services.learner.ppo import Dataset, LearningRate, PPOConfig, UpdateMode, minibatches
+from tests.unit.services.learner.test_ppo import make_data, update
 
 RATE = 1e-3
 
@@ -106,4 +106,23 @@ def test_mean_actions_beyond_the_joints_range_are_pulled_back_by_the_bound_weigh
     [(100, 50, [50, 50]), (90, 40, [40, 40]), (100, 40, [40, 40, 20]), (30, 64, [30])],
 )
 def test_a_remainder_smaller_than_half_a_minibatch_is_left_out(frames, size, expected):
-    assert [len(rows) for rows in minibatches(frames, size, torch.Generator().manual_seed(0))] == expected
+    data = make_data(new_network(NetworkConfig(units=(16,))), frames)
+    batches = list(minibatches(data, size, torch.Generator().manual_seed(0)))
+
+    assert [len(batch) for batch in batches] == expected
+
+
+def test_a_pass_takes_every_frame_once_with_all_that_belongs_to_it():
+    data = make_data(new_network(NetworkConfig(units=(16,))), 96)
+    number = torch.arange(96.0)
+    numbered = replace(data, advantages=number, value_targets=-number)
+    batches = list(minibatches(numbered, 32, torch.Generator().manual_seed(0)))
+    order = torch.cat([batch.advantages for batch in batches])
+
+    assert not torch.equal(order, number)
+    assert torch.equal(order.sort().values, number)
+    for batch in batches:
+        rows = batch.advantages.long()
+        assert torch.equal(batch.value_targets, -batch.advantages)
+        for name in ("obs", "actions", "log_mu", "log_prox", "mean_prox", "corrections"):
+            assert torch.equal(getattr(batch, name), getattr(data, name)[rows]), name

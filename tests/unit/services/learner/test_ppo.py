@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from common.policy.actor_critic import NetworkConfig, log_prob
+from common.policy.network_pass import NetworkPass
 from common.policy.weights import new_network
 from services.learner.ppo import (
     Dataset,
@@ -16,8 +17,14 @@ from services.learner.ppo import (
     correction_loss,
     explained_variance,
     policy_loss,
-    update,
 )
+from services.learner.ppo import update as update_by
+
+
+def update(network, optimizer, data, config, *arguments, **named):
+    return update_by(
+        NetworkPass(network, config.minibatch, config.products), optimizer, data, config, *arguments, **named
+    )
 
 
 def column(*values):
@@ -104,10 +111,10 @@ def make_data(network, count=512, seed=0):
         log_mu,
         log_mu.clone(),
         mean,
-        log_std,
         advantages,
         obs[:, 1].clone(),
         nothing,
+        log_std,
     )
 
 

@@ -60,7 +60,7 @@ def test_the_same_data_train_the_same_policy_bit_for_bit():
 
 
 def test_an_update_uses_the_normaliser_of_its_actors():
-    training = make_training()
+    training = make_training(ppo=PPO.model_copy(update={"precision": "float32"}))
     rollouts = dataset(0)
     frozen = training.obs_moments
 
@@ -289,7 +289,7 @@ def test_a_new_normaliser_does_not_change_what_a_later_stage_plays():
 
 
 def test_a_correction_stays_with_its_observation():
-    training = make_training()
+    training = make_training(ppo=PPO.model_copy(update={"precision": "float32"}))
     rollouts = []
     for rollout in dataset(0):
         corrections = np.repeat(rollout.obs[..., :1], 7, axis=-1)

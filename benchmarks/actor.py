@@ -1,0 +1,95 @@
+"""Speed of one actor's playing, without messages, and its share of MuJoCo's own speed.
+
+    python -m benchmarks.actor --json
+
+It plays rollouts as an actor does: inference, noise, environment, hit corrections. The limit is ``Batch.step`` of the
+same robots with the same actions. Both alternate on one thread.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from threading import Event
+
+import numpy as np
+from pydantic import Field
+
+from benchmarks.env import bare_mujoco
+from benchmarks.paired import paired
+from benchmarks.play import HORIZON, make_player
+from benchmarks.settings import BenchmarkConfig, run
+from common.comms.codec import encode
+from common.comms.messages import Rollout
+from common.env.robot import home_action
+from common.policy.actor_critic import NetworkConfig
+from common.task.config import TaskConfig
+from services.actor.player import Player
+from services.learner.curriculum import CurriculumConfig
+from services.learner.ppo import PPOConfig
+from services.learner.training import Training
+
+
+def playing(player: Player) -> Callable[[], Rollout]:
+    """Return a function that plays the next rollout."""
+    sequence = iter(range(2**31))
+    return lambda: player.play("benchmark", 1, next(sequence))
+
+
+def measure(envs: int, seconds: float, seed: int) -> dict[str, float]:
+    """Play for ``seconds`` and return the figures."""
+    task, network = TaskConfig(), NetworkConfig()
+    training = Training(
+        PPOConfig(),
+        network,
+        CurriculumConfig(),
+        home_action(task.robot),
+        seed,
+        observation=task.observation,
+    )
+    player = make_player(training, network, 3, envs, seed)
+    play, step = playing(player), bare_mujoco(player.env)
+    actions = np.clip(play().actions, -1.0, 1.0)
+
+    def mujoco() -> None:
+        for action in actions:
+            step(action)
+
+    measured = paired(play, mujoco, seconds)
+    rollouts = [play() for _ in range(3)]
+    inference = float(np.median([rollout.seconds["inference"] for rollout in rollouts]))
+    return {
+        "frames_per_s": round(HORIZON * envs / measured.seconds, 1),
+        "mujoco_frames_per_s": round(HORIZON * envs / measured.limit, 1),
+        "ratio": round(measured.share, 4),
+        "inference_share": round(inference / measured.seconds, 4),
+        "bytes_per_frame": round(len(encode(rollouts[0])) / (HORIZON * envs), 1),
+        "envs": envs,
+    }
+
+
+class ActorBenchmarkConfig(BenchmarkConfig):
+    """Measure how fast one actor plays, and compare it with MuJoCo's own step of the same robots."""
+
+    envs: int = Field(256, ge=1, le=65536, description="environments of the actor")
+    seconds: float = Field(
+        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="of rallies and noise")
+
+
+def main(config: ActorBenchmarkConfig, _stop: Event) -> int:
+    """Measure and print."""
+    result = measure(config.envs, config.seconds, config.seed)
+    if config.json_line:
+        print(json.dumps(result))
+    else:
+        print(
+            f"{result['frames_per_s']:,.0f} frames/s, {result['ratio']:.1%} of MuJoCo's own "
+            f"{result['mujoco_frames_per_s']:,.0f} ({config.envs} environments); inference "
+            f"{result['inference_share']:.1%}; {result['bytes_per_frame']:.0f} bytes a frame"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run("actor", ActorBenchmarkConfig, main))

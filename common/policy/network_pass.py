@@ -1,0 +1,191 @@
+"""The actor-critic's forward and backward pass, written out: the learner's hot loop.
+
+It computes what ``ActorCritic`` and autograd compute, at the same precision (a test compares them), with fewer passes
+over memory. Each layer has one input array for its whole life: [previous layer's output, observation, 1]. ELU writes
+its output into the next layer's input, so that nothing is concatenated; the column of ones makes the bias a column of
+the weights. Weights are cast once a gradient step. The gradient with respect to observations is not computed.
+"""
+
+from itertools import pairwise
+from typing import Any, Final, Literal
+
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from common.policy.actor_critic import ActorCritic
+from common.policy.elementwise import elu, elu_gradient, place
+
+Precision = Literal["float32", "bfloat16"]
+DTYPES: Final[dict[Precision, torch.dtype]] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+def native_precision() -> Precision:
+    """Return bfloat16 where the CPU multiplies it natively, and float32 elsewhere."""
+    can = torch.cpu.get_capabilities()
+    return "bfloat16" if can.get("avx512_bf16") or can.get("amx_bf16") else "float32"
+
+
+def _bits(tensor: Tensor) -> npt.NDArray[Any]:
+    """Return a tensor's memory as the kernels read it: float32, or the bits of bfloat16 (uint16)."""
+    return (tensor.view(torch.uint16) if tensor.dtype is torch.bfloat16 else tensor).numpy()
+
+
+class _Layer:
+    """A linear layer with arrays of its own: inputs [hidden, observation, 1], outputs, and their gradients.
+
+    Args:
+        linear: Its parameters.
+        observed: How many numbers of the observation it takes after the hidden ones.
+        rows: Largest batch.
+        dtype: Of its products.
+    """
+
+    def __init__(self, linear: nn.Linear, observed: int, rows: int, dtype: torch.dtype) -> None:
+        self.linear = linear
+        self.observed = observed
+        self.hidden = linear.in_features - observed
+        self.weights = torch.empty((linear.out_features, linear.in_features + 1), dtype=dtype)
+        self.inputs = torch.ones((rows, linear.in_features + 1), dtype=dtype)
+        self.outputs = torch.empty((rows, linear.out_features), dtype=dtype)
+        self.slope = torch.empty_like(self.outputs)  # of the loss, with respect to the outputs
+        self.input_bits, self.output_bits, self.slope_bits = map(
+            _bits, (self.inputs, self.outputs, self.slope)
+        )
+
+    def cast(self) -> None:
+        """Take the parameters as they are now."""
+        self.weights[:, :-1].copy_(self.linear.weight)
+        self.weights[:, -1].copy_(self.linear.bias)
+
+    def take(self, obs: Tensor) -> None:
+        """Take the observations (n, ...) of a batch."""
+        if self.observed:
+            place(_bits(obs), self.observed, self.input_bits, self.hidden)
+
+    def forward(self, count: int) -> Tensor:
+        """Return the outputs (count, n) of the first ``count`` inputs."""
+        return torch.mm(self.inputs[:count], self.weights.t(), out=self.outputs[:count])
+
+    def backward(self, count: int) -> None:
+        """Set the parameters' gradients, given the outputs' slope."""
+        gradient = torch.mm(self.slope[:count].t(), self.inputs[:count])
+        for parameter, part in ((self.linear.weight, gradient[:, :-1]), (self.linear.bias, gradient[:, -1])):
+            parameter.grad = torch.empty_like(parameter).copy_(part)
+
+    def hidden_slope(self, count: int) -> Tensor:
+        """Return the slope with respect to the hidden inputs (count, hidden)."""
+        return torch.mm(self.slope[:count], self.weights[:, : self.hidden])
+
+
+class NetworkPass:
+    """Forward and backward pass of one network over batches of up to ``rows`` observations.
+
+    Args:
+        network: ``refresh`` reads its parameters; ``backward`` sets their ``grad``.
+        rows: Largest batch.
+        precision: Of the products, and of the numbers between layers.
+    """
+
+    def __init__(self, network: ActorCritic, rows: int, precision: Precision) -> None:
+        self.network = network
+        self.rows = rows
+        self.dtype = DTYPES[precision]
+
+        def layer(linear: nn.Module, observed: int = 0) -> _Layer:
+            if not isinstance(linear, nn.Linear):
+                raise TypeError(f"{type(linear).__name__} as a layer; allowed: Linear")
+            return _Layer(linear, observed, rows, self.dtype)
+
+        self._trunk = [layer(linear, network.obs_size) for linear in network.trunk.layers]
+        head = network.critic_head
+        linears = [] if head is None else [part for part in head if isinstance(part, nn.Linear)]
+        taken = [linear.in_features - network.trunk.out_features for linear in linears[:1]] + [0] * len(
+            linears
+        )
+        self._critic = [layer(linear, observed) for linear, observed in zip(linears, taken, strict=False)]
+        self._mean, self._value = layer(network.mean), layer(network.value)
+        self._count = 0  # observations of the last forward pass
+        self.refresh()
+
+    @torch.no_grad()
+    def refresh(self) -> None:
+        """Take the network's parameters as they are now; call it whenever they have changed."""
+        for layer in (*self._trunk, self._mean, *self._critic, self._value):
+            layer.cast()
+
+    @torch.no_grad()
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean actions (n, A) and normalised values (n,), float32, as ``ActorCritic.forward`` does.
+
+        Args:
+            obs: The critic's observations, normalised (n, D), contiguous, of this pass's ``dtype``.
+        """
+        self._count = count = len(obs)
+        self._run_trunk(obs)
+        chain = [*self._critic, self._value]
+        for layer in chain:
+            layer.take(obs)
+        place(self._mean.input_bits[:count], self._mean.hidden, chain[0].input_bits, 0)
+        self._run(chain, count)
+        mean, value = self._mean.forward(count), self._value.forward(count).squeeze(-1)
+        return mean.to(torch.float32, copy=True), value.to(torch.float32, copy=True)
+
+    @torch.no_grad()
+    def act(self, obs: Tensor) -> Tensor:
+        """Return mean actions (n, A), float32, as ``ActorCritic.act`` does.
+
+        Args:
+            obs: The policy's observations, normalised (n, obs_size), contiguous, of this pass's ``dtype``.
+        """
+        self._run_trunk(obs)
+        return self._mean.forward(len(obs)).to(torch.float32, copy=True)
+
+    def _run_trunk(self, obs: Tensor) -> None:
+        """Run the trunk, up to the inputs of ``mean``."""
+        chain = [*self._trunk, self._mean]
+        for layer in chain:
+            layer.take(obs)
+        self._run(chain, len(obs))
+
+    @staticmethod
+    def _run(layers: list[_Layer], count: int) -> None:
+        """Run layers with ELU between them, up to the inputs of the last."""
+        for layer, following in pairwise(layers):
+            layer.forward(count)
+            elu(layer.output_bits[:count], following.input_bits)
+
+    def evaluate(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what ``forward`` does, for any number of observations of any precision."""
+        parts = [self.forward(part.to(self.dtype)) for part in torch.split(obs, self.rows)]
+        means, values = zip(*parts, strict=True)
+        return torch.cat(means), torch.cat(values)
+
+    @torch.no_grad()
+    def backward(self, mean: Tensor | None, value: Tensor | None) -> None:
+        """Set the gradients of the parameters for the last ``forward``; ``log_std`` is not one of its.
+
+        Args:
+            mean: Slope of the loss with respect to the mean actions (n, A); None: only the critic's own layers learn.
+            value: Slope with respect to the values (n,); None: 0.
+        """
+        count = self._count
+        self._value.slope[:count, 0] = 0.0 if value is None else value
+        slope = self._back([*self._critic, self._value], count, is_needed=mean is not None)
+        if mean is None:
+            return
+        self._mean.slope[:count] = mean
+        self._mean.backward(count)
+        last = self._trunk[-1]
+        torch.add(slope, self._mean.hidden_slope(count), out=last.slope[:count])
+        elu_gradient(self._mean.input_bits, last.slope_bits[:count])
+        self._back(self._trunk, count, is_needed=False)
+
+    def _back(self, layers: list[_Layer], count: int, is_needed: bool) -> Tensor:
+        """Set the gradients of layers with ELU between them; return the slope of the first one's hidden inputs."""
+        for before, layer in reversed(list(pairwise(layers))):
+            layer.backward(count)
+            torch.mm(layer.slope[:count], layer.weights[:, : layer.hidden], out=before.slope[:count])
+            elu_gradient(layer.input_bits, before.slope_bits[:count])
+        layers[0].backward(count)
+        return layers[0].hidden_slope(count) if is_needed else torch.empty(0)
