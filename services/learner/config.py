@@ -27,8 +27,8 @@ class LearnerOptions(BaseModel):
     intake: IntakeConfig = IntakeConfig()
     evaluated_weights: EvaluatedWeights = Field(
         "mean",
-        description="which weights are evaluated and saved as a policy: mean: their running mean over about 100 "
-        "datasets; newest: those of the last update, which actors play",
+        description="which weights are evaluated and saved as a policy: mean: their running mean over the last "
+        "tenth of the training, at most 100 datasets; newest: those of the last update, which actors play",
     )
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}

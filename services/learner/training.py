@@ -209,7 +209,7 @@ class Training:
     def _update_ema(self) -> None:
         """Update the running mean of the weights."""
         age = self.progress.version + 1
-        weight = 1.0 / min(max(AVERAGE_SHARE * age, 1.0), AVERAGE_DATASETS)
+        weight = 1.0 / min(1.0 + AVERAGE_SHARE * age, AVERAGE_DATASETS)
         torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
 
     def _enter(self, stage: int) -> None:

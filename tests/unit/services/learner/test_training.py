@@ -140,6 +140,27 @@ def test_the_evaluated_weights_are_the_mean_or_the_newest():
     assert training.weights("newest") is training.network
 
 
+def test_the_mean_of_young_weights_covers_a_tenth_of_the_training():
+    """A mean over 100 datasets from the start on was half as good as the newest weights after 350."""
+    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100}))
+    expected = training.average.mean.weight.detach().double().clone()
+    for epoch in range(30):
+        training.run_epoch(dataset(epoch % 3))
+        expected += (training.network.mean.weight.detach() - expected) / (1.0 + (epoch + 1) / 10.0)
+
+    torch.testing.assert_close(training.average.mean.weight.double(), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_mean_of_old_weights_covers_100_datasets():
+    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100}))
+    training.progress = replace(training.progress, version=100_000)
+    before = training.average.mean.weight.detach().clone()
+    training.run_epoch(dataset(0))
+    moved = training.average.mean.weight - before
+
+    torch.testing.assert_close(moved, (training.network.mean.weight - before) / 100.0, rtol=1e-3, atol=1e-9)
+
+
 def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
     raw = 0.3 * make_rollout(77).obs.reshape(-1, 37)
 
