@@ -10,7 +10,7 @@ POLICY ?=
 VIDEO ?=
 OUT ?=
 
-.PHONY: help install train play pictures report test test-fast check fix bench docs clean
+.PHONY: help install train play pictures report test test-fast check fix bench bench-guard docs clean
 
 help:                     ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
@@ -56,7 +56,12 @@ bench: $(STAMP)           ## the quick benchmarks
 	$(BIN)/python -m benchmarks.env --json
 	$(BIN)/python -m benchmarks.camera_filter --json
 	$(BIN)/python -m benchmarks.flight_filter --json
+	$(BIN)/python -m benchmarks.actor --json
+	$(BIN)/python -m benchmarks.learner --json
 	$(BIN)/python -m benchmarks.system --json
+
+bench-guard: $(STAMP)     ## fail where a part is much slower against its limit than recorded
+	$(BIN)/python -m benchmarks.guard
 
 docs: $(STAMP)            ## the documentation as pages: build/site/index.html
 	$(BIN)/mkdocs build --strict --quiet

@@ -20,6 +20,7 @@ from common.physics import touch
 from common.physics.flight import Air
 from common.physics.fly import NO_ROBOT, RobotPath, fly_to_touch
 from common.physics.vec import Vec, cross
+from common.task.coarse_flight import UNSURE, VALID, coarse_verdict
 from common.task.config import TaskConfig
 from common.task.counter_rng import Stream, between, bits, normal_pair, uniform
 from common.task.launch_presets import LEVELS, PRESETS, Curve, Preset
@@ -158,6 +159,9 @@ def is_valid(position: Vec, velocity: Vec, spin: Vec, air: Air, no_robot: RobotP
     """Return whether the ball starts in free air, crosses the net, and its first touch is the robot's court."""
     if touch.table_gap(position)[0] <= 0.0 or touch.net_gap(position)[0] <= 0.0:
         return False
+    verdict = coarse_verdict(position, velocity, spin, air)
+    if verdict != UNSURE:
+        return verdict == VALID
     _, _, _, what, _ = fly_to_touch(position, velocity, spin, LONGEST_FLIGHT, air, no_robot)
     return what == touch.ROBOT_COURT
 

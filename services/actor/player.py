@@ -106,7 +106,9 @@ class Player:
             started = self._clock()
             obs[t] = self._obs
             with torch.inference_mode():
-                mean = self._network_pass.act(torch.from_numpy(normalize(self._obs[:, :width], self._moments)))
+                mean = self._network_pass.act(
+                    torch.from_numpy(normalize(self._obs[:, :width], self._moments))
+                )
                 noise = torch.randn(mean.shape, generator=self._noise)
                 action = mean + self._network.log_std.exp() * noise
                 log_mu[t] = log_prob(action, mean, self._network.log_std).numpy()
