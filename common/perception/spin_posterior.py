@@ -21,9 +21,10 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from common.jit import kernel
+from common.jit import inlined, kernel
 from common.perception.cholesky import factor, inverse
 from common.physics.constants import BALL_RADIUS, ROLLING_ALPHA, SPIN_PER_VELOCITY
+from common.physics.exponential import erfc, exp
 from common.physics.vec import Vec, dot, vec_at
 
 Array = npt.NDArray[np.float64]
@@ -31,6 +32,7 @@ Array = npt.NDArray[np.float64]
 # [rad/s] radii of the two spheres in which the spins of mild and of strong balls are uniform
 MILD_RADIUS, STRONG_RADIUS = 100.0, 300.0
 TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA = 0.25, 0.029  # [-] of the tables of profile `standard`
+_MILD_DENSITY = (STRONG_RADIUS / MILD_RADIUS) ** 3
 _EDGE_WIDTH = 8.0  # [rad/s] the density falls to 0 over this much at a sphere's surface
 _SIDESPIN_WIDENING = (
     1.3  # [-] sidespin is drawn wider than the flight's error by this factor, so no weight is large
@@ -43,6 +45,7 @@ _MIN_NORMAL_CHANGE = 0.1  # [m/s]
 _MAX_FRICTION_SIGMAS = 6.0  # [-] all friction farther off is equally improbable
 _LIFT_SIGMA = 0.115  # [-] of the lift factor: uniform in 0.8..1.2
 _ROOT_2_PI = math.sqrt(2.0 * math.pi)
+_ROOT_HALF = math.sqrt(0.5)
 
 
 class MeasuredBounce(NamedTuple):
@@ -78,21 +81,17 @@ def quasi_random(count: int) -> Array:
 POINTS: Final = quasi_random(96)
 
 
-@kernel
+@inlined
 def densities(rate: float) -> tuple[float, float]:
     """Return the density of spins of ``rate`` [rad/s] among mild balls, and among strong ones.
 
     Both kinds are uniform in a sphere of spins. The unit is the density in the larger sphere.
     """
     in_mild = min(max(0.5 + 0.5 * (MILD_RADIUS - rate) / _EDGE_WIDTH, 0.0), 1.0)
-    in_strong = min(
-        max(
-            0.5 + 0.5 * (STRONG_RADIUS - rate) / _EDGE_WIDTH,
-            _TAIL_DENSITY * (STRONG_RADIUS / max(rate, STRONG_RADIUS)) ** 5,
-        ),
-        1.0,
-    )
-    return in_mild * (STRONG_RADIUS / MILD_RADIUS) ** 3, in_strong
+    beyond = STRONG_RADIUS / max(rate, STRONG_RADIUS)
+    tail = _TAIL_DENSITY * (beyond * beyond) * (beyond * beyond) * beyond
+    in_strong = min(max(0.5 + 0.5 * (STRONG_RADIUS - rate) / _EDGE_WIDTH, tail), 1.0)
+    return in_mild * _MILD_DENSITY, in_strong
 
 
 @kernel
@@ -127,6 +126,141 @@ def flight_information(visible: Vec, covariance: Array, prior: float, vector: Ar
             matrix[i, j] -= less * along[i] * along[j]
 
 
+@inlined
+def _sign(x: float) -> float:
+    return 1.0 if x >= 0.0 else -1.0
+
+
+@kernel
+def _draw_slips(bounce: MeasuredBounce, max_rate: float, points: Array, slips: Array) -> None:
+    """Draw slips c that explain the measured change, one of either kind of bounce a point.
+
+    Args:
+        bounce: The measured change of velocity.
+        max_rate: Largest spin to consider [rad/s].
+        points: ``quasi_random`` (n, 4).
+        slips: Written (6, n): change of velocity along the table x, y [m/s]; |c| [m/s] and weight of a ball that leaves
+            rolling, and of one that slides. A weight of 0: no such bounce.
+    """
+    before, change, error = bounce
+    normal_change = max(change[2], _MIN_NORMAL_CHANGE)  # (1 + e)|v_n|
+    for p in range(points.shape[0]):
+        dx = change[0] + error[0] * points[p, 0]
+        dy = change[1] + error[1] * points[p, 0] + error[2] * points[p, 1]
+        size = max(math.sqrt(dx * dx + dy * dy), 1e-6)
+        ux, uy = dx / size, dy / size
+        friction_sigmas = min(
+            (size / normal_change - TABLE_FRICTION_MEAN) / TABLE_FRICTION_SIGMA, _MAX_FRICTION_SIGMAS
+        )
+        rolling = (
+            size / ROLLING_ALPHA
+        )  # |c| of a ball that leaves rolling, and the least |c| of one that slides
+        slips[0, p], slips[1, p], slips[2, p] = dx, dy, rolling
+        slips[3, p] = 0.5 * erfc(friction_sigmas * _ROOT_HALF) / (ROLLING_ALPHA * ROLLING_ALPHA)
+        # c = -|c| u, so the spin in the table's plane lies on a line. Its slowest point has the rate ``slowest`` and
+        # |c| = ``nearest``
+        nearest = -(before[0] * ux + before[1] * uy)
+        slowest = (before[0] * uy - before[1] * ux) / BALL_RADIUS
+        half = BALL_RADIUS * math.sqrt(max(max_rate * max_rate - slowest * slowest, 0.0))
+        # |c| = nearest + half t |t|: dense near the slowest spin
+        low = max((rolling - nearest) / max(half, 1e-9), -1.0)
+        low = _sign(low) * math.sqrt(abs(low))
+        t = low + (1.0 - low) * points[p, 2]
+        slip = nearest + half * t * abs(t)
+        weight = exp(-0.5 * friction_sigmas * friction_sigmas) / (_ROOT_2_PI * TABLE_FRICTION_SIGMA)
+        weight *= slip / (size * normal_change) * half * 2.0 * abs(t) * (1.0 - low)
+        slips[4, p], slips[5, p] = slip, weight if half > 0.0 and nearest + half > rolling else 0.0
+
+
+@kernel
+def _weigh_spins(
+    before: Vec,
+    flight: FlightEvidence,
+    mild_probability: float,
+    points: Array,
+    slips: Array,
+    kind: int,
+    spins: Array,
+) -> None:
+    """Weigh the spins that belong to the slips of one kind of bounce.
+
+    Args:
+        before: Velocity before the bounce [m/s].
+        flight: Evidence of the flight before the bounce.
+        mild_probability: Prior probability that the ball is a mild one.
+        points: ``quasi_random`` (n, 4).
+        slips: Of ``_draw_slips``.
+        kind: Row of its |c|: 2 or 4.
+        spins: Written (6, n): log likelihood, weight, part of the weight of mild balls, spin after the bounce [rad/s].
+    """
+    vector, matrix, saturation = flight
+    xx, xy, yy = matrix[0, 0], matrix[1, 0], matrix[1, 1]
+    xz, yz, zz = matrix[2, 0], matrix[2, 1], matrix[2, 2]
+    information = zz + 1.0 / (_VISIBLE_SPIN_SIGMA * _VISIBLE_SPIN_SIGMA)
+    sidespin_sigma = _SIDESPIN_WIDENING / math.sqrt(information)
+    strong_probability = max(1.0 - mild_probability, _MIN_STRONG_PROBABILITY)
+    square = saturation * saturation
+    for p in range(points.shape[0]):
+        dx, dy, slip, weight = slips[0, p], slips[1, p], slips[kind, p], slips[kind + 1, p]
+        size = max(math.sqrt(dx * dx + dy * dy), 1e-6)
+        wx = (-slip * (dy / size) - before[1]) / BALL_RADIUS
+        wy = (before[0] + slip * (dx / size)) / BALL_RADIUS
+        flat = wx * wx + wy * wy
+        # The visible sidespin is drawn around the flight's estimate of it, and then scaled to the true sidespin
+        part = min(1.0, saturation / math.sqrt(flat + 1e-9))
+        middle = (vector[2] - part * (xz * wx + yz * wy)) / information
+        seen = min(max(middle, -0.9 * saturation), 0.9 * saturation) + sidespin_sigma * points[p, 3]
+        rest = square - seen * seen
+        weight = weight if rest > 0.0 else 0.0
+        rest = max(rest, 1e-9)
+        stretch = math.sqrt(max(flat / rest, 1.0))
+        wz = seen * stretch
+        weight *= square / rest * stretch if stretch > 1.0 else 1.0
+        rate = max(math.sqrt(flat + wz * wz), 1e-6)
+        share = min(rate, saturation) / rate
+        sx, sy, sz = share * wx, share * wy, share * wz
+        spins[0, p] = (
+            0.5 * points[p, 3] * points[p, 3]
+            + (vector[0] * sx + vector[1] * sy + vector[2] * sz)
+            - 0.5 * (xx * sx * sx + yy * sy * sy + zz * sz * sz)
+            - (xy * sx * sy + xz * sx * sz + yz * sy * sz)
+        )
+        mild_density, strong_density = densities(rate)
+        spins[2, p] = weight * mild_probability * mild_density
+        spins[1, p] = spins[2, p] + weight * strong_probability * strong_density
+        spins[3, p] = wx + SPIN_PER_VELOCITY * dy
+        spins[4, p] = wy - SPIN_PER_VELOCITY * dx
+        spins[5, p] = wz
+
+
+@kernel
+def _top(spins: Array) -> float:
+    """Return the largest log likelihood of spins (6, n) that have a weight."""
+    top = -math.inf
+    for p in range(spins.shape[1]):
+        if spins[1, p] > 0.0:
+            top = max(top, spins[0, p])
+    return top
+
+
+@kernel
+def _weighted_sums(spins: Array, top: float) -> tuple[float, float, float, float, float]:
+    """Return the sums of weights, of mild balls' weights, and of the weighted spins (6, n), relative to e^``top``."""
+    count = spins.shape[1]
+    for p in range(count):
+        spins[0, p] = exp(min(spins[0, p] - top, 0.0))
+    total, mild, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0
+    for p in range(count):
+        if spins[1, p] > 0.0:
+            weight = spins[1, p] * spins[0, p]
+            total += weight
+            mild += spins[2, p] * spins[0, p]
+            x += weight * spins[3, p]
+            y += weight * spins[4, p]
+            z += weight * spins[5, p]
+    return total, mild, x, y, z
+
+
 @kernel
 def spin_after_bounce(
     bounce: MeasuredBounce, flight: FlightEvidence, mild_probability: float, fallback: Vec, points: Array
@@ -141,91 +275,17 @@ def spin_after_bounce(
         points: ``quasi_random`` (n, 4). The error with ``POINTS`` is a third of the posterior's spread, and increases
             it by a twentieth.
     """
-    before, change, error = bounce
-    vector, matrix, saturation = flight
     count = points.shape[0]
-    weights, mild_weights = np.zeros(2 * count), np.zeros(2 * count)
-    logs, spins = np.empty(2 * count), np.empty((2 * count, 3))
-    normal_change = max(change[2], _MIN_NORMAL_CHANGE)  # (1 + e)|v_n|
+    # Two arrays: columns of one are not contiguous, and LLVM would not vectorise
+    slips, rolling, sliding = np.empty((6, count)), np.empty((6, count)), np.empty((6, count))
     max_rate = (STRONG_RADIUS if mild_probability < 1.0 else MILD_RADIUS) + _EDGE_WIDTH
-    sidespin_information = matrix[2, 2] + 1.0 / (_VISIBLE_SPIN_SIGMA * _VISIBLE_SPIN_SIGMA)
-    sidespin_sigma = _SIDESPIN_WIDENING / math.sqrt(sidespin_information)
-    top = -math.inf
-    for p in range(count):
-        dx = change[0] + error[0] * points[p, 0]
-        dy = change[1] + error[1] * points[p, 0] + error[2] * points[p, 1]
-        size = max(math.hypot(dx, dy), 1e-6)
-        ux, uy = dx / size, dy / size
-        friction_sigmas = min(
-            (size / normal_change - TABLE_FRICTION_MEAN) / TABLE_FRICTION_SIGMA, _MAX_FRICTION_SIGMAS
-        )
-        rolling = (
-            size / ROLLING_ALPHA
-        )  # |c| of a ball that leaves rolling, and the least |c| of one that slides
-        # c = -|c| u, so the spin in the table's plane lies on a line. Its slowest point has the rate ``slowest`` and
-        # |c| = ``nearest``
-        nearest = -(before[0] * ux + before[1] * uy)
-        slowest = (before[0] * uy - before[1] * ux) / BALL_RADIUS
-        for kind in range(2):
-            if kind == 0:
-                slip = rolling
-                weight = 0.5 * math.erfc(friction_sigmas * math.sqrt(0.5)) / (ROLLING_ALPHA * ROLLING_ALPHA)
-            else:
-                half = BALL_RADIUS * math.sqrt(max(max_rate * max_rate - slowest * slowest, 0.0))
-                if half == 0.0 or nearest + half <= rolling:
-                    continue
-                # |c| = nearest + half t |t|: dense near the slowest spin
-                low = max((rolling - nearest) / half, -1.0)
-                low = math.copysign(math.sqrt(abs(low)), low)
-                t = low + (1.0 - low) * points[p, 2]
-                slip = nearest + half * t * abs(t)
-                weight = math.exp(-0.5 * friction_sigmas * friction_sigmas) / (
-                    _ROOT_2_PI * TABLE_FRICTION_SIGMA
-                )
-                weight *= slip / (size * normal_change) * half * 2.0 * abs(t) * (1.0 - low)
-            wx, wy = (-slip * uy - before[1]) / BALL_RADIUS, (before[0] + slip * ux) / BALL_RADIUS
-            flat = wx * wx + wy * wy
-            # The visible sidespin is drawn around the flight's estimate of it, and then scaled to the true sidespin
-            part = min(1.0, saturation / math.sqrt(flat + 1e-9))
-            middle = (vector[2] - part * (matrix[2, 0] * wx + matrix[2, 1] * wy)) / sidespin_information
-            sz = min(max(middle, -0.9 * saturation), 0.9 * saturation) + sidespin_sigma * points[p, 3]
-            wz, rest = sz, saturation * saturation - sz * sz
-            if rest <= 0.0:
-                continue
-            if flat > rest:
-                wz = sz * math.sqrt(flat / rest)
-                weight *= saturation * saturation / rest * math.sqrt(flat / rest)
-            rate = max(math.sqrt(flat + wz * wz), 1e-6)
-            visible_share = min(rate, saturation) / rate
-            sx, sy, sz = visible_share * wx, visible_share * wy, visible_share * wz
-            i = 2 * p + kind
-            logs[i] = (
-                0.5 * points[p, 3] ** 2
-                + (vector[0] * sx + vector[1] * sy + vector[2] * sz)
-                - 0.5 * (matrix[0, 0] * sx * sx + matrix[1, 1] * sy * sy + matrix[2, 2] * sz * sz)
-                - (matrix[1, 0] * sx * sy + matrix[2, 0] * sx * sz + matrix[2, 1] * sy * sz)
-            )
-            mild_density, strong_density = densities(rate)
-            mild_weights[i] = weight * mild_probability * mild_density
-            weights[i] = (
-                mild_weights[i]
-                + weight * max(1.0 - mild_probability, _MIN_STRONG_PROBABILITY) * strong_density
-            )
-            if weights[i] > 0.0:
-                top = max(top, logs[i])
-            spins[i, 0] = wx + SPIN_PER_VELOCITY * dy
-            spins[i, 1] = wy - SPIN_PER_VELOCITY * dx
-            spins[i, 2] = wz
-    total, total_mild, x, y, z = 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(2 * count):
-        if weights[i] > 0.0:
-            likelihood = math.exp(logs[i] - top)
-            weight = weights[i] * likelihood
-            total += weight
-            total_mild += mild_weights[i] * likelihood
-            x += weight * spins[i, 0]
-            y += weight * spins[i, 1]
-            z += weight * spins[i, 2]
+    _draw_slips(bounce, max_rate, points, slips)
+    _weigh_spins(bounce.before, flight, mild_probability, points, slips, 2, rolling)
+    _weigh_spins(bounce.before, flight, mild_probability, points, slips, 4, sliding)
+    top = max(_top(rolling), _top(sliding))
+    a, b = _weighted_sums(rolling, top), _weighted_sums(sliding, top)
+    total = a[0] + b[0]
     if not total > 0.0:
         return fallback, mild_probability
-    return (x / total, y / total, z / total), total_mild / total
+    spin = ((a[2] + b[2]) / total, (a[3] + b[3]) / total, (a[4] + b[4]) / total)
+    return spin, (a[1] + b[1]) / total

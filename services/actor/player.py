@@ -14,7 +14,7 @@ from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
 from common.env.teacher import teacher_of
 from common.policy.actor_critic import NetworkConfig, log_prob
 from common.policy.contract import training_hash
-from common.policy.network_pass import NetworkPass
+from common.policy.network_pass import NetworkPass, native_precision
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import install, new_network
 from common.task.config import TaskConfig
@@ -60,7 +60,8 @@ class Player:
         self.snapshot: PolicySnapshot | None = None
         self._obs_size = size(critic_layout(task.observation))
         self._network = new_network(network, task.observation)  # only its policy is used
-        self._network_pass = NetworkPass(self._network, envs, "float32")
+        # As the learner's: then a rollout of the newest policy has the learner's own probabilities, to the last bits
+        self._network_pass = NetworkPass(self._network, envs, native_precision())
         self._moments = Moments.initial(self._network.obs_size)
         self._noise = torch.Generator()
         self._seed = seed
