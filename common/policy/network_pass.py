@@ -119,8 +119,9 @@ class NetworkPass:
         """Return mean actions (n, A) and normalised values (n,), float32, as ``ActorCritic.forward`` does.
 
         Args:
-            obs: The critic's observations, normalised (n, D), contiguous, of this pass's ``dtype``.
+            obs: The critic's observations, normalised (n, D), contiguous.
         """
+        obs = obs.to(self.dtype)
         self._count = count = len(obs)
         self._run_trunk(obs)
         chain = [*self._critic, self._value]
@@ -136,9 +137,9 @@ class NetworkPass:
         """Return mean actions (n, A), float32, as ``ActorCritic.act`` does.
 
         Args:
-            obs: The policy's observations, normalised (n, obs_size), contiguous, of this pass's ``dtype``.
+            obs: The policy's observations, normalised (n, obs_size), contiguous.
         """
-        self._run_trunk(obs)
+        self._run_trunk(obs.to(self.dtype))
         return self._mean.forward(len(obs)).to(torch.float32, copy=True)
 
     def _run_trunk(self, obs: Tensor) -> None:
@@ -156,8 +157,8 @@ class NetworkPass:
             elu(layer.output_bits[:count], following.input_bits)
 
     def evaluate(self, obs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what ``forward`` does, for any number of observations of any precision."""
-        parts = [self.forward(part.to(self.dtype)) for part in torch.split(obs, self.rows)]
+        """Return what ``forward`` does, for any number of observations."""
+        parts = [self.forward(part) for part in torch.split(obs, self.rows)]
         means, values = zip(*parts, strict=True)
         return torch.cat(means), torch.cat(values)
 

@@ -51,6 +51,13 @@ class RobotDescription(_Table):
     racket: str = Field("racket", description="the racket's cylinder geom; a site of this name has its frame")
     links: tuple[str, ...] = Field(description="geoms that can strike something, in the order of the sensors")
     self_contacts: tuple[tuple[str, str], ...] = Field(description="pairs of the robot's geoms that can meet")
+    cover_s: float = Field(
+        0.012,
+        ge=0.008,  # MuJoCo needs two of its steps
+        le=0.1,
+        description="time constant of the covers where they meet: shorter is stiffer",
+        json_schema_extra={"unit": "s"},
+    )
     joint: tuple[JointDrive, ...] = Field(description="from the base to the racket")
 
     @model_validator(mode="after")

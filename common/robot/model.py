@@ -33,7 +33,6 @@ STALL: Final = 6.0
 NO_LOAD: Final = 0.9  # of the speed limit: the speed at which the motor's torque vanishes
 LINEAR_LOSS, CUBIC_LOSS = 0.5, 1.5  # at the speed limit, over the drive's force
 COVER: Final = 0.030  # [m] thickness of the soft covers
-COVER_SOLREF: Final = "0.012 1"  # time constant [s], three of MuJoCo's longest steps; damping ratio
 COVER_SOLIMP: Final = "0.5 0.95 0.03"  # softest at the surface, stiff at the hard part under it
 SURROUNDINGS: Final = ("table", "net", "floor")
 
@@ -166,7 +165,7 @@ def robot_xml(name: str) -> str:
                 geom2=second,
                 condim="1",
                 margin=str(COVER),
-                solref=COVER_SOLREF,
+                solref=f"{robot.cover_s} 1",  # critically damped
                 solimp=COVER_SOLIMP,
             )
         )

@@ -35,5 +35,8 @@ def markdown() -> str:
                 f"{joint.force:g} {force} | {joint.kp:g} | {joint.kv:g} |"
             )
         pairs = ", ".join(f"{first} and {second}" for first, second in robot.self_contacts)
-        lines += ["", f"Parts of its own that can meet: {pairs}."]
+        lines += [
+            "",
+            f"Parts of its own that can meet: {pairs}. Time constant of their covers: {robot.cover_s:g} s.",
+        ]
     return "\n".join(lines) + "\n"

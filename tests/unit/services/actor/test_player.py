@@ -10,6 +10,7 @@ from common.env.rally_env import Launches
 from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import PolicyError, contract_hash
 from common.policy.folder import load_policy
+from common.policy.network_pass import native_precision
 from common.policy.normalizer import normalize
 from common.policy.weights import new_network, observation_moments, pack
 from common.rally.hit_correction import BACK
@@ -92,13 +93,16 @@ def test_its_log_mu_is_that_of_the_policy_at_its_observations(block):
     moments = observation_moments(
         snapshot.obs_mean, snapshot.obs_var, snapshot.obs_count, critic_layout(OBSERVATION)
     )
+    is_bfloat16 = native_precision() == "bfloat16"
     with torch.no_grad():
-        mean, _ = network(torch.from_numpy(normalize(block.obs.reshape(-1, SIZE), moments)))
-        normal = torch.distributions.Normal(mean, network.log_std.exp())
+        with torch.autocast("cpu", torch.bfloat16, enabled=is_bfloat16):
+            mean, _ = network(torch.from_numpy(normalize(block.obs.reshape(-1, SIZE), moments)))
+        normal = torch.distributions.Normal(mean.float(), network.log_std.exp())
         log_mu = normal.log_prob(torch.from_numpy(block.actions.reshape(-1, 7))).sum(-1)
 
-    # float32 sums over 7 terms in another order
-    np.testing.assert_allclose(block.log_mu.reshape(-1), log_mu.numpy(), atol=2e-4)
+    # sums in another order; now and then they round to another bfloat16: 0.4 % of a mean, in deviations of 0.2
+    np.testing.assert_allclose(block.log_mu.reshape(-1), log_mu.numpy(), atol=0.1 if is_bfloat16 else 2e-4)
+    assert np.median(np.abs(block.log_mu.reshape(-1) - log_mu.numpy())) < 1e-3
 
 
 def test_only_the_policy_acts_and_it_observes_only_its_own_part(block):
