@@ -59,7 +59,7 @@ class RewardConfig(BaseModel):
         0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"}
     )
     collision: float = Field(
-        2.0,
+        10.0,
         ge=0,
         le=100,
         description="e: weight of sum min(F_c/50 N, 1) over the links: contacts with table, floor, net, robot",
