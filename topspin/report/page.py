@@ -37,7 +37,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
         return tuple(drawing for drawing in drawings if drawing.name.startswith(beginnings))
 
     config = found.settings
-    rounds = tables.rounds(found)
+    rounds, differences = tables.rounds(found), tables.differences(found)
     parts = [
         Section(
             "",
@@ -51,6 +51,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
         Section("In words", note(config.note)),
         Section("Missing or unequal", missing=found.missing),
         Section("Beside the paper", tables=(tables.headline(found),)),
+        Section("Differences, seed by seed", tables=(differences,) if differences else ()),
         Section("Training", drawings=named("curves")),
         Section("Every seed", tables=(tables.by_seed(found),)),
     ]

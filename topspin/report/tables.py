@@ -7,6 +7,7 @@ from typing import Any, Final
 from common.evaluation.breakdown import BREAKDOWNS
 from common.policy.folder import Policy
 from common.task.states import Outcome
+from topspin.report.paired import Comparison, comparisons
 from topspin.report.results import GroupResult, Results, RunResult, Spread, mean_of
 
 NOTHING: Final = "–"
@@ -163,6 +164,36 @@ def by_seed(found: Results) -> Table:
         "after catch", "error", "median", "< 0.2 m", "< 0.3 m",
     )  # fmt: skip
     return Table("Every seed", columns, tuple(rows))
+
+
+MEASURED: Final = {
+    "return_rate": ("returned", 100.0, "points", 1),
+    "return_after_catch": ("returned after catch", 100.0, "points", 1),
+    "target_error_mean": ("target error", 1.0, "m", 3),
+}
+"""Name, scale, unit and digits of each compared measure."""
+
+
+def _comparison_row(one: Comparison) -> tuple[str, ...]:
+    name, scale, unit, digits = MEASURED[one.measure]
+    found = one.difference
+    low, mean, high = (f"{scale * value:+.{digits}f}" for value in (found.low, found.mean, found.high))
+    p = "< 0.001" if found.p < 0.001 else f"{found.p:.3f}"
+    return f"{one.second} minus {one.first}", name, f"{mean} {unit}", f"{low} to {high}", p, str(found.pairs)
+
+
+def differences(found: Results) -> Table | None:
+    """Return the paired differences between experiments that share seeds; None if no two do."""
+    rows = tuple(_comparison_row(one) for one in comparisons(found.groups))
+    if not rows:
+        return None
+    return Table(
+        "Differences, seed by seed",
+        ("experiments", "measure", "mean difference", "95 % interval", "p", "pairs"),
+        rows,
+        note="Paired t-test over the seeds that both experiments have, two-sided, not corrected for the number of "
+        "rows. An interval that contains 0 shows no difference; it does not show that there is none.",
+    )
 
 
 def _run_row(one: GroupResult, result: RunResult) -> tuple[str, ...]:

@@ -1,0 +1,77 @@
+"""Differences between experiments whose runs share seeds: mean, 95 % interval and p-value of a paired t-test.
+
+Runs of one seed start from the same network and play the same measured balls. So a difference is taken seed by seed,
+and the spread of these differences says how sure their mean is. With three seeds an interval is wide: 2.5 times the
+standard deviation of the differences to each side.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from topspin.report.results import GroupResult
+
+COMPARED: Final = ("return_rate", "return_after_catch", "target_error_mean")
+"""Measures whose differences are reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Mean of b - a over pairs."""
+
+    mean: float
+    low: float  # 95 % interval
+    high: float
+    p: float  # two-sided
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Two experiments by one measure."""
+
+    first: str  # label
+    second: str
+    measure: str
+    difference: Difference  # second - first
+
+
+def difference(a: Sequence[float], b: Sequence[float]) -> Difference:
+    """Return the mean of b - a with its interval and p-value (Student's t for pairs).
+
+    Raises:
+        ValueError: Fewer than two pairs, or numbers that do not pair.
+    """
+    if len(a) != len(b) or len(a) < 2:
+        raise ValueError(f"{len(a)} and {len(b)} values; allowed: two or more pairs")
+    apart = np.subtract(b, a)
+    if np.ptp(apart) == 0.0:  # no spread: the test has no denominator
+        return Difference(
+            float(apart[0]), float(apart[0]), float(apart[0]), float(apart[0] == 0.0), len(apart)
+        )
+    test = stats.ttest_rel(b, a)
+    interval = test.confidence_interval(0.95)
+    return Difference(
+        float(apart.mean()), float(interval.low), float(interval.high), float(test.pvalue), len(apart)
+    )
+
+
+def comparisons(groups: Sequence[GroupResult]) -> list[Comparison]:
+    """Return all differences between experiments that share two or more seeds."""
+    found = []
+    for one, other in combinations(groups, 2):
+        a, b = (
+            {run.seed: run.measures for run in group.runs if run.played is not None} for group in (one, other)
+        )
+        seeds = sorted(a.keys() & b.keys())
+        for measure in COMPARED:
+            pairs = [(a[seed].get(measure), b[seed].get(measure)) for seed in seeds]
+            known = [(x, y) for x, y in pairs if x is not None and y is not None]
+            if len(known) >= 2:
+                first, second = zip(*known, strict=True)
+                found.append(Comparison(one.label, other.label, measure, difference(first, second)))
+    return found
