@@ -83,21 +83,30 @@ def test_the_springs_stop_a_ball_before_its_centre_reaches_the_middle_of_the_rac
 
 
 @pytest.mark.parametrize("speed", [2.0, 5.0, 8.0])
-def test_the_table_returns_97_percent_of_the_normal_speed(speed):
+def test_the_table_returns_92_percent_of_the_normal_speed(speed):
+    """As our table's law does at 3 m/s: 0.98 - 0.02 * 3. MuJoCo's restitution does not fall with the speed."""
     env = with_ball((-0.7, 0.5, 0.02 + 0.004 * speed, 0, 0, -speed, 0, 0, 0), State.TAU_01)
     env.step(hold(env))
     drag = 1.0 - 0.28 * 0.55 * speed * 0.020  # over the step, bounce included
     # gravity after the bounce cancels gravity before it, except for the difference of the two times
-    assert env.rallies.ball[0, 5] == pytest.approx(0.97 * speed * drag, abs=0.2)
+    assert env.rallies.ball[0, 5] == pytest.approx(0.92 * speed * drag, abs=0.2)
 
 
-@pytest.mark.parametrize("speed", [3.0, 8.0])
-def test_the_racket_returns_85_percent_of_the_normal_speed(speed):
-    env = with_ball((RACKET_X + 0.0265 + 0.01 * speed, 0, 0.226, -speed, 0, 0, 0, 0, 0))
-    env.step(hold(env))
+def test_the_racket_returns_79_percent_of_the_normal_speed():
+    """As inverted rubber's law does at 4.35 m/s: 0.878 - 0.020 * 4.35, on average over the time in a step.
 
-    # the racket, 0.17 kg on an elastic arm, moves back a little
-    assert env.rallies.ball[0, 3] == pytest.approx(0.84 * speed, rel=0.06)
+    Drag takes 1 % of the speed on the way. A ball that begins its contact at another time in a step may leave with
+    0.70 or with 0.85 of its speed.
+    """
+    speed, returned = 4.35, []
+    for late in np.linspace(0.0, 1.0, 20, endpoint=False):
+        away = 0.0265 + (0.01 + late * STEP) * speed
+        env = with_ball((RACKET_X + away, 0, 0.226, -speed, 0, 0, 0, 0, 0))
+        env.step(hold(env))
+        returned.append(env.rallies.ball[0, 3] / speed)
+
+    assert np.mean(returned) == pytest.approx(0.78, abs=0.02)
+    assert np.std(returned) < 0.08
 
 
 def test_topspin_speeds_the_ball_up_at_the_bounce_and_backspin_slows_it():

@@ -186,6 +186,7 @@ def test_a_gradient_that_is_not_finite_is_skipped_and_reported():
     )
 
     assert not stats.finite
+    assert stats.learning_rate == pytest.approx(1e-3 / 1.5)
     for name, value in network.state_dict().items():
         assert torch.equal(value, before[name])
 
