@@ -100,10 +100,8 @@ class NetworkPass:
         self._trunk = [layer(linear, network.obs_size) for linear in network.trunk.layers]
         head = network.critic_head
         linears = [] if head is None else [part for part in head if isinstance(part, nn.Linear)]
-        taken = [linear.in_features - network.trunk.out_features for linear in linears[:1]] + [0] * len(
-            linears
-        )
-        self._critic = [layer(linear, observed) for linear, observed in zip(linears, taken, strict=False)]
+        beyond_trunk = linears[0].in_features - network.trunk.out_features if linears else 0
+        self._critic = [layer(linear, 0 if k else beyond_trunk) for k, linear in enumerate(linears)]
         self._mean, self._value = layer(network.mean), layer(network.value)
         self._count = 0  # observations of the last forward pass
         self.refresh()

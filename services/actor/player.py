@@ -60,7 +60,7 @@ class Player:
         self.snapshot: PolicySnapshot | None = None
         self._obs_size = size(critic_layout(task.observation))
         self._network = new_network(network, task.observation)  # only its policy is used
-        # As the learner's: then a rollout of the newest policy has the learner's own probabilities, to the last bits
+        # The learner's default: then a rollout of the newest policy has the learner's own probabilities
         self._network_pass = NetworkPass(self._network, envs, native_precision())
         self._moments = Moments.initial(self._network.obs_size)
         self._noise = torch.Generator()
