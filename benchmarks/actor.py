@@ -16,17 +16,12 @@ from pydantic import Field
 
 from benchmarks.env import bare_mujoco
 from benchmarks.paired import paired
-from benchmarks.play import HORIZON, make_player
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.play import HORIZON, make_player, make_training
+from benchmarks.settings import TimedConfig, run
 from common.comms.codec import encode
 from common.comms.messages import Rollout
-from common.env.robot import home_action
-from common.policy.actor_critic import NetworkConfig
-from common.task.config import TaskConfig
 from services.actor.player import Player
-from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
-from services.learner.training import Training
 
 
 def playing(player: Player) -> Callable[[], Rollout]:
@@ -37,16 +32,7 @@ def playing(player: Player) -> Callable[[], Rollout]:
 
 def measure(envs: int, seconds: float, seed: int) -> dict[str, float]:
     """Play for ``seconds`` and return the figures."""
-    task, network = TaskConfig(), NetworkConfig()
-    training = Training(
-        PPOConfig(),
-        network,
-        CurriculumConfig(),
-        home_action(task.robot),
-        seed,
-        observation=task.observation,
-    )
-    player = make_player(training, network, 3, envs, seed)
+    player = make_player(make_training(PPOConfig(), seed), envs, seed)
     play, step = playing(player), bare_mujoco(player.env)
     actions = np.clip(play().actions, -1.0, 1.0)
 
@@ -67,14 +53,10 @@ def measure(envs: int, seconds: float, seed: int) -> dict[str, float]:
     }
 
 
-class ActorBenchmarkConfig(BenchmarkConfig):
+class ActorBenchmarkConfig(TimedConfig):
     """Measure how fast one actor plays, and compare it with MuJoCo's own step of the same robots."""
 
     envs: int = Field(256, ge=1, le=65536, description="environments of the actor")
-    seconds: float = Field(
-        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
-    )
-    seed: int = Field(0, ge=0, lt=2**63, description="of rallies and noise")
 
 
 def main(config: ActorBenchmarkConfig, _stop: Event) -> int:

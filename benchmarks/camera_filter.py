@@ -20,7 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from benchmarks.env import ACTIONS, RALLIES, SLICE, SPREAD, MemoryRallies, seconds_of
+from benchmarks.env import ACTIONS, RALLIES, SPREAD, MemoryRallies, play, slices
+from benchmarks.paired import paired
 from benchmarks.settings import BenchmarkConfig, run
 from common.env.rally_env import RallyEnv
 from common.jit import kernel
@@ -204,15 +205,8 @@ def throughput_share(envs: int, randomization: Randomization, seconds: float, se
     actions = np.clip(cheap.home_action + spread, -1.0, 1.0).astype(np.float32)
     for env in (cheap, full):
         env.reset()
-        seconds_of(env.step, actions)  # compiles, and spreads the rallies over their phases
-    shares: list[float] = []
-    start = time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        part = actions[(np.arange(SLICE) + SLICE * len(shares)) % ACTIONS]
-        order = (cheap, full) if len(shares) % 2 == 0 else (full, cheap)
-        taken = {env: seconds_of(env.step, part) for env in order}
-        shares.append(taken[cheap] / taken[full])
-    return float(np.median(shares))
+        play(env.step, actions)  # compiles, and spreads the rallies over their phases
+    return paired(slices(full.step, actions), slices(cheap.step, actions), seconds).share
 
 
 class CameraFilterConfig(BenchmarkConfig):

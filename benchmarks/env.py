@@ -9,9 +9,9 @@ step. Short slices of both alternate, so that a busy machine slows both alike. R
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import count
 from threading import Event
 
 import numpy as np
@@ -19,7 +19,8 @@ import numpy.typing as npt
 from mujoco.batch import Batch
 from pydantic import Field
 
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.paired import paired
+from benchmarks.settings import TimedConfig, run
 from common.env.rally_env import Launches, RallyEnv
 from common.robot.model import load_model
 from common.task.config import Randomization, TaskConfig
@@ -58,12 +59,10 @@ class Speed:
     substeps: int
 
 
-def seconds_of(step: Callable[[Actions], object], actions: Actions) -> float:
-    """Return the duration of a slice [s]."""
-    start = time.perf_counter()
+def play(step: Callable[[Actions], object], actions: Actions) -> None:
+    """Take a control step with each of ``actions``."""
     for action in actions:
         step(action)
-    return time.perf_counter() - start
 
 
 def bare_mujoco(env: RallyEnv) -> Callable[[Actions], None]:
@@ -90,28 +89,24 @@ def measure(envs: int, randomization: str, seconds: float, seed: int) -> Speed:
     mujoco = bare_mujoco(env)
     env.reset()
     for step in (env.step, mujoco):
-        seconds_of(step, actions)  # compiles the kernels, and spreads the rallies over their phases
-    slices: list[tuple[float, float]] = []
-    start = time.perf_counter()
-    while time.perf_counter() - start < seconds:
-        part = actions[(np.arange(SLICE) + SLICE * len(slices)) % ACTIONS]
-        slices.append((seconds_of(env.step, part), seconds_of(mujoco, part)))
-    taken = np.array(slices)
-    env_rate, mujoco_rate = SLICE * envs / np.median(taken, axis=0)
-    return Speed(
-        float(env_rate), float(mujoco_rate), float(np.median(taken[:, 1] / taken[:, 0])), env.robot.substeps
-    )
+        play(step, actions)  # compiles the kernels, and spreads the rallies over their phases
+    ours, theirs = (slices(step, actions) for step in (env.step, mujoco))
+    measured = paired(ours, theirs, seconds)
+    env_rate, mujoco_rate = (SLICE * envs / duration for duration in (measured.seconds, measured.limit))
+    return Speed(env_rate, mujoco_rate, measured.share, env.robot.substeps)
 
 
-class EnvConfig(BenchmarkConfig):
+def slices(step: Callable[[Actions], object], actions: Actions) -> Callable[[], None]:
+    """Return a function that takes the next ``SLICE`` control steps; after the last action the first comes again."""
+    starts = count(0, SLICE)
+    return lambda: play(step, actions[(np.arange(SLICE) + next(starts)) % len(actions)])
+
+
+class EnvConfig(TimedConfig):
     """Measure the speed of the environment on one thread, and compare it with MuJoCo's own step of the same robots."""
 
     envs: int = Field(512, ge=1, le=65536, description="robots in the batch")
     randomization: Randomization = Field("standard", description="profile of what differs between rallies")
-    seconds: float = Field(
-        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
-    )
-    seed: int = Field(0, ge=0, lt=2**63, description="of rallies and actions")
 
 
 def main(config: EnvConfig, _stop: Event) -> int:

@@ -19,17 +19,13 @@ from pydantic import Field
 from torch import nn
 
 from benchmarks.paired import paired, seconds_of
-from benchmarks.play import make_player
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.play import make_player, make_training
+from benchmarks.settings import TimedConfig, run
 from common.comms.codec import encode
-from common.env.robot import home_action
-from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.actor_critic import ActorCritic
 from common.policy.network_pass import DTYPES
-from common.task.config import TaskConfig
 from services.learner.admission import open_rollout
-from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
-from services.learner.training import Training
 
 ROLLOUTS = 4  # played before the measurement, and repeated
 
@@ -68,16 +64,8 @@ def bare_products(network: ActorCritic, frames: int, ppo: PPOConfig) -> tuple[Ca
 
 def measure(envs: int, seconds: float, seed: int, ppo: PPOConfig) -> dict[str, float | str]:
     """Train for ``seconds`` and return the figures."""
-    task, network = TaskConfig(), NetworkConfig()
-    training = Training(
-        ppo,
-        network,
-        CurriculumConfig(first_stage=3),
-        home_action(task.robot),
-        seed,
-        observation=task.observation,
-    )
-    player = make_player(training, network, 3, envs, seed)
+    training = make_training(ppo, seed)
+    player = make_player(training, envs, seed)
     rollouts = [player.play("benchmark", 1, sequence) for sequence in range(ROLLOUTS)]
     payload = encode(rollouts[0])
     following = cycle(rollouts)
@@ -107,14 +95,10 @@ def measure(envs: int, seconds: float, seed: int, ppo: PPOConfig) -> dict[str, f
     }
 
 
-class LearnerBenchmarkConfig(BenchmarkConfig):
+class LearnerBenchmarkConfig(TimedConfig):
     """Measure how fast the learner trains from memory, and compare it with its matrix products alone."""
 
     envs: int = Field(256, ge=1, le=65536, description="environments; a dataset has 32 frames of each")
-    seconds: float = Field(
-        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
-    )
-    seed: int = Field(0, ge=0, lt=2**63, description="of network and rallies")
     ppo: PPOConfig = PPOConfig()
 
 

@@ -24,12 +24,19 @@ def seconds_of(act: Callable[[], object]) -> float:
 
 
 def paired(task: Callable[[], object], limit: Callable[[], object], seconds: float) -> Paired:
-    """Alternate calls of both for ``seconds``, at least three times, after one call of each to warm up."""
+    """Call both in turn for ``seconds``, at least three times, after one call of each to warm up.
+
+    The other one begins in every second turn.
+    """
     task(), limit()
     taken: list[tuple[float, float]] = []
     start = time.perf_counter()
     while len(taken) < 3 or time.perf_counter() - start < seconds:
-        taken.append((seconds_of(task), seconds_of(limit)))
+        if len(taken) % 2 == 0:
+            own_s, limit_s = seconds_of(task), seconds_of(limit)
+        else:
+            limit_s, own_s = seconds_of(limit), seconds_of(task)
+        taken.append((own_s, limit_s))
     both = np.array(taken)
     own, bound = np.median(both, axis=0)
     return Paired(float(own), float(bound), float(np.median(both[:, 1] / both[:, 0])))

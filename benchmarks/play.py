@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from benchmarks.env import MemoryRallies
+from benchmarks.env import RALLIES, MemoryRallies
 from common.comms.messages import PolicySnapshot
+from common.env.robot import home_action
 from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import contract_hash, training_hash
 from common.policy.weights import pack
@@ -11,15 +12,27 @@ from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
 from services.actor.player import Player
+from services.learner.curriculum import CurriculumConfig
+from services.learner.ppo import PPOConfig
 from services.learner.training import Training
 
-RALLIES = 20_000  # drawn before the measurement, and repeated
 HORIZON = 32  # control steps of a rollout
 
 
-def make_player(training: Training, network: NetworkConfig, stage: int, envs: int, seed: int) -> Player:
-    """Return a player with the policy of ``training``."""
-    task, experience = TaskConfig(), ExperienceConfig()
+STAGE = 3  # the stage that a run spends most of its frames in
+
+
+def make_training(ppo: PPOConfig, seed: int) -> Training:
+    """Return a new training of the default task and network."""
+    task = TaskConfig()
+    curriculum = CurriculumConfig(first_stage=STAGE)
+    home = home_action(task.robot)
+    return Training(ppo, NetworkConfig(), curriculum, home, seed, observation=task.observation)
+
+
+def make_player(training: Training, envs: int, seed: int) -> Player:
+    """Return a player with the policy of a training of ``make_training``."""
+    task, experience, network = TaskConfig(), ExperienceConfig(), training.network_config
     source = MemoryRallies(draw_rallies(RALLIES, task, seed=seed))
     player = Player(task, experience, network, source, envs, HORIZON, seed)
     moments = training.obs_moments
@@ -28,7 +41,7 @@ def make_player(training: Training, network: NetworkConfig, stage: int, envs: in
             run="benchmark",
             generation=1,
             version=training.progress.version,
-            stage=stage,
+            stage=STAGE,
             stage_number=0,
             epoch=0,
             frames=0,

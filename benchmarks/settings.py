@@ -21,6 +21,15 @@ class BenchmarkConfig(BaseModel):
     json_line: bool = Field(False, alias="json", description="print one JSON object as the last line")
 
 
+class TimedConfig(BenchmarkConfig):
+    """Settings of a benchmark that measures for a while."""
+
+    seconds: float = Field(
+        10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
+    )
+    seed: int = Field(0, ge=0, lt=2**63, description="of all random numbers")
+
+
 _Config = TypeVar("_Config", bound=BenchmarkConfig)
 
 

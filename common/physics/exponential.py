@@ -15,16 +15,19 @@ _LOWEST = -700.0  # exp of less is no normal number
 
 
 def _power_of_2_code(_typing: Any, exponent: Any) -> Any:
-    def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(64)
-        biased = builder.add(builder.fptosi(arguments[0], word), ir.Constant(word, 1023))
-        return builder.bitcast(builder.shl(biased, ir.Constant(word, 52)), ir.DoubleType())
+    def code(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        is_single = signature.args[0] == types.float32
+        bits, bias, fraction = (32, 127, 23) if is_single else (64, 1023, 52)
+        word = ir.IntType(bits)
+        biased = builder.add(builder.fptosi(arguments[0], word), ir.Constant(word, bias))
+        kind = ir.FloatType() if is_single else ir.DoubleType()
+        return builder.bitcast(builder.shl(biased, ir.Constant(word, fraction)), kind)
 
-    return types.float64(exponent), code
+    return exponent(exponent), code
 
 
-_power_of_2: Any = intrinsic(_power_of_2_code)
-"""2^k as a float64, for a whole k in a float64, of -1022 to 1023."""
+power_of_2: Any = intrinsic(_power_of_2_code)
+"""2^k for a whole k, both as float32 (k of -126 to 127) or as float64 (-1022 to 1023)."""
 
 
 @inlined
@@ -36,7 +39,7 @@ def exp(x: float) -> float:
     series = 1.0 + r * (
         1.0 + r * (1 / 2 + r * (1 / 6 + r * (1 / 24 + r * (1 / 120 + r * (1 / 720 + r * (1 / 5040))))))
     )
-    result: float = series * _power_of_2(whole)
+    result: float = series * power_of_2(whole)
     return result
 
 

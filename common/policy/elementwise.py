@@ -13,6 +13,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from common.jit import kernel
+from common.physics.exponential import power_of_2
 
 # (2^r - 1)/r on [-1/2, 1/2], highest power first: Cephes' exp2f
 _C5, _C4, _C3, _C2, _C1, _C0 = (
@@ -52,20 +53,8 @@ def _rounded_code(_typing: Any, value: Any, like: Any) -> Any:
     return like(value, like), code
 
 
-def _power_of_2_code(_typing: Any, exponent: Any) -> Any:
-    """Return 2^exponent as a float32, for an integer in a float32, of -126 to 127."""
-
-    def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(32)
-        biased = builder.add(builder.fptosi(arguments[0], word), ir.Constant(word, 127))
-        return builder.bitcast(builder.shl(biased, ir.Constant(word, 23)), ir.FloatType())
-
-    return types.float32(exponent), code
-
-
 _as_float32: Any = intrinsic(_as_float32_code)
 _rounded: Any = intrinsic(_rounded_code)
-_power_of_2: Any = intrinsic(_power_of_2_code)
 
 
 @kernel
@@ -78,7 +67,7 @@ def elu(inputs: Any, outputs: Any) -> None:
             x = _as_float32(source[j])
             scaled = max(min(x, _0), _LOWEST) * _LOG2_E
             whole = np.floor(scaled + _HALF)
-            r, power = scaled - whole, _power_of_2(whole)
+            r, power = scaled - whole, power_of_2(whole)
             rest = ((((_C5 * r + _C4) * r + _C3) * r + _C2) * r + _C1) * r + _C0
             y = rest * r * power + (power - _1)  # exp(x) - 1, without loss of digits near 0
             target[j] = _rounded(x if x > _0 else y, source[j])

@@ -274,7 +274,7 @@ def update(
     """Run the mini-epochs of one epoch. The network and ``optimizer`` are changed in place.
 
     Args:
-        network_pass: Of policy and critic, for a minibatch or more.
+        network_pass: Of policy and critic as they are now, for a minibatch or more.
         optimizer: Adam over their parameters.
         data: This epoch's dataset.
         config: Hyper-parameters.
@@ -289,8 +289,6 @@ def update(
     learns = mode is not UpdateMode.CRITIC_ONLY
     for parameter in network.policy_parameters():
         parameter.requires_grad_(learns)  # a frozen one has no gradient, so that Adam does not change it
-    data = replace(data, obs=data.obs.to(network_pass.dtype))
-    network_pass.refresh()
     sums = np.zeros(6)
     is_corrected = config.correction_weight > 0 and learns and bool((data.corrections != 0.0).any())
     learning_rate = rate.start
