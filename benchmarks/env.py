@@ -42,8 +42,9 @@ class MemoryRallies:
     def __init__(self, block: RallyBlock) -> None:
         self._block, self._next = block, 0
 
-    def take(self, count: int) -> Launches:
-        """Return the next ``count`` rallies. After the last one the first comes again."""
+    def take(self, rows: npt.NDArray[np.int64]) -> Launches:
+        """Return the next rallies, one for each of ``rows`` (n,). After the last one the first comes again."""
+        count = rows.size
         index = np.arange(self._next, self._next + count) % len(self._block.seeds)
         self._next += count
         return Launches(self._block.launches[index], self._block.seeds[index], np.ones(count, np.bool_))

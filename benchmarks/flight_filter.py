@@ -21,14 +21,14 @@ from common.env.rally_env import RallyEnv
 from common.perception.flight_filter import INTERCEPTION_AFTER
 from common.perception.flight_track import INTERCEPTION, PRESENT, SPIN
 from common.physics.constants import GRID_STEP
-from common.physics.flight import SIMPLE, flight_step
+from common.physics.flight import FULL, flight_step
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.table_bounce import table_bounce
 from common.rally.state import SAMPLE
 from common.task.config import Randomization, TaskConfig
 from common.task.experience import MATCH
-from common.task.launch import LONGEST_FLIGHT, RallyBlock, draw_rallies
-from common.task.launch_presets import PresetName
+from common.task.launch import KIND, LONGEST_FLIGHT, RallyBlock, draw_rallies
+from common.task.launch_presets import SERVE, PresetName
 from common.task.observation import ExpectedSpin
 from common.task.randomization import RallyParameter, air_of
 from common.task.states import State
@@ -45,10 +45,13 @@ def truth(block: RallyBlock, parameters: Array) -> tuple[Array, Array]:
     bounce, interception = np.empty(len(block.seeds)), np.empty((len(block.seeds), 9))
     for k, (launch, rally) in enumerate(zip(block.launches, parameters, strict=True)):
         pos, vel, spin = tuple(launch[:3]), tuple(launch[3:6]), tuple(launch[6:9])
-        air = air_of(rally, SIMPLE)
-        pos, vel, bounce[k], _, normal = fly_to_touch(pos, vel, spin, LONGEST_FLIGHT, air, NO_ROBOT)
+        air = air_of(rally, FULL)
         restitution, friction = rally[[RallyParameter.TABLE_RESTITUTION0, RallyParameter.TABLE_FRICTION]]
-        vel, spin = table_bounce(vel, spin, normal, restitution, friction)
+        bounce[k] = 0.0
+        for _ in range(2 if launch[KIND] == SERVE else 1):
+            pos, vel, flown, _, normal = fly_to_touch(pos, vel, spin, LONGEST_FLIGHT, air, NO_ROBOT)
+            vel, spin = table_bounce(vel, spin, normal, restitution, friction)
+            bounce[k] += flown
         for _ in range(round(INTERCEPTION_AFTER / GRID_STEP)):
             pos, vel = flight_step(pos, vel, spin, GRID_STEP, air)
         interception[k] = [*pos, *vel, *spin]
@@ -86,7 +89,9 @@ def compare(
             axis=1,
         )
         for moment in MOMENTS_MS:
-            rows = in_play & (since == moment) & (rallies.state < State.TAU_2)
+            rows = (
+                in_play & (since == moment) & ((rallies.state < State.TAU_2) | (rallies.state >= State.TAU_S))
+            )
             found[moment].append(errors[rows])
     return {moment: np.concatenate(parts) for moment, parts in found.items()}
 

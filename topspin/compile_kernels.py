@@ -20,7 +20,7 @@ def compile_kernels() -> None:
     env.reset()
     for _ in range(3):
         env.step(np.zeros((2, 7)))
-    unplayed_flight(np.ones((1, LAUNCH_SIZE)), np.ones((1, RALLY_PARAMETERS)), Flight.SIMPLE)
+    unplayed_flight(np.ones((1, LAUNCH_SIZE)), np.ones((1, RALLY_PARAMETERS)), Flight.FULL)
 
 
 if __name__ == "__main__":

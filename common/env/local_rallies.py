@@ -3,6 +3,7 @@
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from common.env.rally_env import Launches
 from common.task.config import TaskConfig
@@ -25,13 +26,14 @@ class LocalRallies:
         self._block = RallyBlock(np.empty((0, LAUNCH_SIZE)), np.empty(0, np.uint64), 0)
         self._used = 0
 
-    def take(self, count: int) -> Launches:
-        """Return the next ``count`` rallies."""
+    def take(self, rows: npt.NDArray[np.int64]) -> Launches:
+        """Return the next rallies, one for each of the environments ``rows`` (n,)."""
+        count = rows.size
         while len(self._block.seeds) - self._used < count:
             self._draw()
-        rows = slice(self._used, self._used + count)
+        used = slice(self._used, self._used + count)
         self._used += count
-        return Launches(self._block.launches[rows], self._block.seeds[rows], np.ones(count, np.bool_))
+        return Launches(self._block.launches[used], self._block.seeds[used], np.ones(count, np.bool_))
 
     def _draw(self) -> None:
         """Append another block to the rallies that are left."""

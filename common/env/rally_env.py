@@ -12,7 +12,7 @@ from common.env.mujoco_ball import RobotAndBall
 from common.env.mujoco_contacts import MujocoContacts
 from common.env.robot import RobotBatch
 from common.jit import kernel
-from common.perception.flight_track import new_tracks
+from common.perception.flight_track import POSTERIOR_MILD, PRIOR_MILD, new_tracks
 from common.rally.observe import observation_flags, observe
 from common.rally.state import NO_SAMPLE, RING, Rallies, RobotMotion, Rules, allocate
 from common.rally.step import launch_rallies
@@ -35,19 +35,21 @@ _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
 class RallySource(Protocol):
     """Where the environment gets its rallies."""
 
-    def take(self, count: int) -> "Launches":
-        """Return ``count`` launches. Never blocks."""
+    def take(self, rows: Rows) -> "Launches":
+        """Return a launch for each of the environments ``rows`` (n,). Never blocks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Launches:
     """Rallies to play, as generated."""
 
-    launches: Array  # (n, 11) position, velocity, spin, drag factor, lift factor
+    launches: Array  # (n, 12) position, velocity, spin, drag factor, lift factor, kind
     seeds: npt.NDArray[np.uint64]  # (n,)
     validated: Flags  # (n,) False: a launch that was not validated; all rates leave it out
     # (n, path_rows, 7) recorded tracks that drive the balls (``step.snap_to_recorded_track``); None: physics alone
     paths: Array | None = None
+    # (n,) the first balls of unknown opponents: what was learnt of the one before is forgotten; None: no such ball
+    strangers: Flags | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class FinishedRallies:
     validated: Flags  # (n,)
     returns: Floats  # (n,) undiscounted reward of the rally
     lengths: npt.NDArray[np.int32]  # (n,) control steps
-    parameters: Array  # (n, 15) randomization.RallyParameter
+    parameters: Array  # (n, 16) randomization.RallyParameter
     rounds: npt.NDArray[np.int32]  # (n,) which rally of its episode: 1 for the first
 
 
@@ -126,6 +128,7 @@ class RallyEnv:
         extra_observation: Options of a second observation of the same rallies (``observe_extra``), such as a teacher's.
             Its history is not longer than the task's.
         keeps_hits: Whether ``rallies.hit`` is written although hits are not corrected.
+        profile: Ranges of what differs from rally to rally; None: those that the task names.
     """
 
     def __init__(
@@ -140,6 +143,7 @@ class RallyEnv:
         path_rows: int = 0,
         extra_observation: ObservationConfig | None = None,
         keeps_hits: bool = False,
+        profile: RandomizationProfile | None = None,
     ) -> None:
         if path_rows and task.collision == "original":
             raise ValueError("recorded tracks under collision 'original'; allowed: collision 'tailored'")
@@ -148,7 +152,7 @@ class RallyEnv:
         self.experience = experience
         self._contacts = self._make_contacts(threads)
         self.robot = self._contacts.robot
-        self._profile = profile_of(task.randomization, task.rubber)
+        self._profile = profile or profile_of(task.randomization, task.rubber)
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
         self._hit_corrector = (
@@ -329,9 +333,12 @@ class RallyEnv:
 
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
         """Launch the next rallies on ``rows``. Where ``same_episode`` the robot starts where it is."""
-        new = self._source.take(rows.size)
+        new = self._source.take(rows)
         path = self._rallies.true_sample_ring[:, RING:]
         path[rows] = NO_SAMPLE if new.paths is None else new.paths
+        if new.strangers is not None and len(self._rallies.track):
+            unknown = rows[new.strangers]
+            self._rallies.track[unknown, POSTERIOR_MILD] = self._rallies.track[unknown, PRIOR_MILD]
         launch_rallies(self._rallies, rows, new.launches, new.seeds, self._profile)
         self._validated[rows] = new.validated
         self._returns[rows] = 0.0

@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from common.evaluation.measures import MatchResult, measures
 from common.physics.constants import TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
+from common.task.launch import KIND
+from common.task.launch_presets import Kind
 from common.task.states import Outcome
 
 Array = npt.NDArray[np.float64]
@@ -62,11 +64,11 @@ def spins(played: MatchResult) -> Array:
     return spin
 
 
-KINDS: Final = ("topspin", "backspin", "sidespin", "corkscrew", f"under {LITTLE_SPIN:g} rad/s")
+SPIN_KINDS: Final = ("topspin", "backspin", "sidespin", "corkscrew", f"under {LITTLE_SPIN:g} rad/s")
 
 
 def spin_kinds(played: MatchResult) -> Integers:
-    """Return which of KINDS each ball's spin is, by its largest part (n,).
+    """Return which of SPIN_KINDS each ball's spin is, by its largest part (n,).
 
     Topspin and backspin turn about the horizontal across the flight, sidespin about the vertical, corkscrew about
     the flight's own direction.
@@ -79,7 +81,7 @@ def spin_kinds(played: MatchResult) -> Integers:
     parts = np.stack(
         (np.maximum(topspin, 0), np.maximum(-topspin, 0), abs(spin[:, 2]), abs(corkscrew)), axis=1
     )
-    return np.where(spins(played) < LITTLE_SPIN, len(KINDS) - 1, parts.argmax(axis=1))
+    return np.where(spins(played) < LITTLE_SPIN, len(SPIN_KINDS) - 1, parts.argmax(axis=1))
 
 
 def _interval(low: float, high: float) -> str:
@@ -117,9 +119,14 @@ NEVER: Final = (
 )
 
 BREAKDOWNS: Final[dict[str, Breakdown]] = {
+    "kind": Breakdown(
+        "kind of ball",
+        tuple(kind.name.lower() for kind in Kind),
+        lambda played: played.launches[:, KIND].astype(np.int64),
+    ),
     "speed": _by_edges("speed at launch [m/s]", (-_INF, 4, 5, 6, 7, 8, 10, 13, 16, _INF), speeds),
     "spin": _by_edges("spin [rad/s]", (-_INF, 40, 60, 80, 100, 150, 200, 250, 300, 450, 600, _INF), spins),
-    "spin_kind": Breakdown("kind of spin", KINDS, spin_kinds),
+    "spin_kind": Breakdown("kind of spin", SPIN_KINDS, spin_kinds),
     "arrival_y": _by_edges(
         "arrival at the table's end, y [m]",
         (-_INF, -0.9, -0.6, -0.3, 0, 0.3, 0.6, 0.9, _INF),
@@ -158,11 +165,12 @@ def survival(played: MatchResult) -> dict[str, Any]:
     """Return how long rallies last where an episode continues after a return, ready for JSON.
 
     ``rally_length_mean`` is the mean number of balls returned in a row, at most the rounds of an episode. It is the sum
-    of ``survival``. Each round's rate counts only balls that reached the round (Kaplan and Meier 1958). So episodes
-    that the end of the evaluation cuts do not shorten it.
+    of ``survival``. ``rally_length_median`` is the largest number that at least half of the rallies reach.
+    Each round's rate counts only balls that reached the round (Kaplan and Meier 1958). So episodes that the end of the
+    evaluation cuts do not shorten it.
     """
     rounds: list[dict[str, Any]] = []
-    reached, length = 1.0, 0.0
+    reached, length, median = 1.0, 0.0, 0
     for number in range(1, int(played.rounds.max(initial=0)) + 1):
         here = played.of(played.rounds == number)
         found = measures(here)
@@ -171,6 +179,7 @@ def survival(played: MatchResult) -> dict[str, Any]:
         returned = int((here.outcomes == Outcome.RETURNED).sum())
         reached *= returned / found["rallies"]
         length += reached
+        median += reached >= 0.5
         rounds.append(
             {
                 "round": number,
@@ -182,7 +191,7 @@ def survival(played: MatchResult) -> dict[str, Any]:
                 "survival": round(reached, 4),
             }
         )
-    return {"rally_length_mean": round(length, 4), "by_round": rounds}
+    return {"rally_length_mean": round(length, 4), "rally_length_median": median, "by_round": rounds}
 
 
 def on_grid(points: Array, values: Array, edges: tuple[Array, Array]) -> tuple[Array, Integers]:

@@ -38,6 +38,7 @@ def measure(
     match = {
         "launch": task.launch,
         "randomization": task.randomization,
+        "flight": task.flight,
         "rounds": task.rounds,
         "envs": environments(config.rallies, config.envs, task.rounds),
         "seed": config.seed,

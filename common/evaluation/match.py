@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from common.env.rally_env import FinishedRallies, Launches, RallyEnv
+from common.env.rally_env import FinishedRallies, Launches, RallyEnv, RallySource
 from common.evaluation.measures import MatchResult
+from common.evaluation.opponents import OpponentRallies, in_equal_batches
 from common.evaluation.robot_measures import RobotMonitor
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.policy.contract import Contract
@@ -18,7 +19,7 @@ from common.task.config import MatchConditions, PlayConditions, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import Purpose, RallyBlock, draw_rallies
 from common.task.observation import ExpectedSpin
-from common.task.randomization import RallyParameter
+from common.task.randomization import RallyParameter, RandomizationProfile
 
 DEFAULT_ENVS: Final = 250
 EPISODES_EACH: Final = 4  # each environment has rallies for at least so many whole episodes
@@ -71,20 +72,21 @@ class FixedRallies:
         self._dealt = 0
         self._filled = 0
 
-    def take(self, count: int) -> Launches:
-        """Return the next ``count`` launches."""
+    def take(self, rows: npt.NDArray[np.int64]) -> Launches:
+        """Return the next launches, one for each of the environments ``rows`` (n,)."""
+        count = rows.size
         fresh = min(count, len(self._rallies.seeds) - self._dealt)
-        rows = slice(self._dealt, self._dealt + fresh)
+        dealt = slice(self._dealt, self._dealt + fresh)
         extra = (self._filled + np.arange(count - fresh)) % len(self._filler.seeds)
         self._dealt += fresh
         self._filled += count - fresh
         paths = None
         if self._rallies.paths is not None:  # filler rallies have no recorded track
             paths = np.full((count, *self._rallies.paths.shape[1:]), NO_SAMPLE)
-            paths[:fresh] = self._rallies.paths[rows]
+            paths[:fresh] = self._rallies.paths[dealt]
         return Launches(
-            np.concatenate((self._rallies.launches[rows], self._filler.launches[extra])),
-            np.concatenate((self._rallies.seeds[rows], self._filler.seeds[extra])),
+            np.concatenate((self._rallies.launches[dealt], self._filler.launches[extra])),
+            np.concatenate((self._rallies.seeds[dealt], self._filler.seeds[extra])),
             np.arange(count) < fresh,
             paths,
         )
@@ -111,6 +113,8 @@ def play_match(
     task: TaskConfig,
     envs: int = DEFAULT_ENVS,
     on_tick: Callable[[], None] = lambda: None,
+    opponents: npt.NDArray[np.int64] | None = None,
+    profile: RandomizationProfile | None = None,
 ) -> MatchResult:
     """Return the result of ``rallies``, played without exploration noise, in the order in which they ended.
 
@@ -120,15 +124,30 @@ def play_match(
         task: The task.
         envs: Environments played together, at most.
         on_tick: Called between control steps, so that the caller can do other work, or raise.
+        opponents: (n,) number of each rally's opponent. One environment plays all balls of an opponent, in their order,
+            and then knows nothing of the next one. With ``carry_over`` 0 and one round the result does not depend on
+            ``envs``, and its rows have the order of ``rallies``. None: every environment has one opponent.
+        profile: Ranges of what differs from rally to rally; None: those that the task names.
 
     A rally in which the simulation failed is left out, so there may be fewer rows than rallies.
     """
-    envs = environments(len(rallies.seeds), envs, task.rounds)
+    count = len(rallies.seeds) if opponents is None else len(np.unique(opponents))
+    envs = environments(count, envs, task.rounds)
     plain = TaskConfig(randomization=task.randomization)
     filler = draw_rallies(64, plain, seed=0, purpose=Purpose.FALLBACK)
-    source = FixedRallies(rallies, filler)
+    source: RallySource = FixedRallies(rallies, filler)
+    act: Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]] = policy.act
+    if opponents is not None:
+        source, act = OpponentRallies(rallies, opponents, filler), in_equal_batches(policy.act)
     env = RallyEnv(
-        envs, task, source, stage=3, experience=MATCH, path_rows=rallies.path_rows, keeps_hits=True
+        envs,
+        task,
+        source,
+        stage=3,
+        experience=MATCH,
+        path_rows=rallies.path_rows,
+        keeps_hits=True,
+        profile=profile,
     )
     monitor = RobotMonitor(env)
     obs = env.reset()
@@ -136,7 +155,7 @@ def play_match(
     left = len(rallies.seeds)
     while left > 0:
         on_tick()
-        actions = policy.act(obs)
+        actions = act(obs)
         step = env.step(actions)
         monitor.update(actions, step)
         obs = step.obs
@@ -151,7 +170,7 @@ def play_match(
     seeds, parameters = rated("seeds"), rated("parameters")
     launches = launches_of(seeds, rallies)
     bounces, arrivals = unplayed_flight(launches, parameters, task.flight_model)
-    return MatchResult(
+    played = MatchResult(
         seeds=seeds,
         outcomes=rated("outcomes"),
         landing_errors=rated("landing_errors"),
@@ -166,9 +185,16 @@ def play_match(
         arrivals=arrivals,
         robot=monitor.record(),
     )
+    return played if opponents is None else played.of(_in_order(seeds, rallies))
+
+
+def _in_order(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.int64]:
+    """Return the rows of ``seeds`` (n,) in the order of ``rallies``."""
+    order = np.argsort(rallies.seeds)
+    return np.argsort(order[np.searchsorted(rallies.seeds, seeds, sorter=order)])
 
 
 def launches_of(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.float64]:
-    """Return the launches (n, 11) of the rallies with these seeds (n,), all of which ``rallies`` must hold."""
+    """Return the launches (n, 12) of the rallies with these seeds (n,), all of which ``rallies`` must hold."""
     order = np.argsort(rallies.seeds)
     return rallies.launches[order[np.searchsorted(rallies.seeds, seeds, sorter=order)]]

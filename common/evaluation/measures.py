@@ -32,7 +32,7 @@ class MatchResult:
     over: npt.NDArray[np.bool_]  # (n,)
     returns: npt.NDArray[np.float32]  # (n,) reward
     rounds: npt.NDArray[np.int32]  # (n,) number of the rally in its episode, from 1
-    launches: Array  # (n, 11) position [m], velocity [m/s], spin [rad/s], drag and lift factor
+    launches: Array  # (n, 12) position [m], velocity [m/s], spin [rad/s], drag and lift factor, kind
     landings: npt.NDArray[np.float32]  # (n, 2) [m] on the opponent's court, nan where nothing landed
     targets: Array  # (n, 2) [m]
     bounces: Array  # (n, 2) [m] on the robot's court
@@ -41,8 +41,8 @@ class MatchResult:
     )
     robot: RobotRecord | None = None  # what the robot did, in the same order
 
-    def of(self, chosen: npt.NDArray[np.bool_]) -> "MatchResult":
-        """Return the rallies that ``chosen`` (n,) marks."""
+    def of(self, chosen: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> "MatchResult":
+        """Return the rallies that ``chosen`` marks (n,) or numbers."""
         rows = {name: getattr(self, name)[chosen] for name in _COLUMNS}
         return MatchResult(**rows, robot=None if self.robot is None else self.robot.of(chosen))
 

@@ -45,7 +45,7 @@ class RecordedRally:
     ball_vel: Array  # (n, 3) [m/s]
     ball_spin: Array  # (n, 3) [rad/s]
     ball_turn: Array  # (n, 4) quaternion (w, x, y, z): the ball's turn since launch
-    state: Integers  # (n,) 0 tau_01, 1 tau_12, 2 tau_23, 3 tau_30
+    state: Integers  # (n,) 0 tau_01, 1 tau_12, 2 tau_23, 3 tau_30, 4 tau_s0
     # (m, 8) the robot's measurement after each control step: position, velocity, state, and their time [s]
     measurement: Array = field(default_factory=lambda: np.empty((0, SAMPLE + 1)))
     # (s, 5) the camera's detections that arrived: time, position, 1 if accepted; none in perception cheap
@@ -60,11 +60,11 @@ class _Dealer:
         self._rallies = rallies
         self.before_dealing: Callable[[], None] = lambda: None
 
-    def take(self, count: int) -> Launches:
-        """Return the first ``count`` rallies; after the first call they are filler, and not recorded."""
+    def take(self, rows: Integers) -> Launches:
+        """Return the first rallies, one for each of ``rows`` (n,); after the first call they are filler, unrecorded."""
         self.before_dealing()
-        dealt = self._rallies.of(np.arange(count))
-        return Launches(dealt.launches, dealt.seeds, np.ones(count, np.bool_), dealt.paths)
+        dealt = self._rallies.of(np.arange(rows.size))
+        return Launches(dealt.launches, dealt.seeds, np.ones(rows.size, np.bool_), dealt.paths)
 
 
 @dataclass(frozen=True, slots=True)

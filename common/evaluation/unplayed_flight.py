@@ -10,9 +10,10 @@ from common.physics.constants import GRID_STEP, TABLE_HALF_LENGTH
 from common.physics.flight import Air, Flight, flight_step
 from common.physics.fly import NO_ROBOT, RobotPath, fly_step, fly_to_touch
 from common.physics.table_bounce import table_bounce
-from common.physics.touch import NONE, ROBOT_COURT
+from common.physics.touch import NONE, OPPONENT_COURT, ROBOT_COURT
 from common.physics.vec import Vec
-from common.task.launch import LONGEST_FLIGHT
+from common.task.launch import KIND, LONGEST_FLIGHT
+from common.task.launch_presets import SERVE
 from common.task.randomization import RallyParameter, air_of
 
 Array = npt.NDArray[np.float64]
@@ -46,15 +47,18 @@ def _fly(
     spin = (launch[6], launch[7], launch[8])
     for k in range(3):
         bounce[k], arrival[k] = np.nan, np.nan
-    pos, vel, _, what, normal = fly_to_touch(pos, vel, spin, LONGEST_FLIGHT, air, no_robot)
-    if what != ROBOT_COURT:
-        return
-    for k in range(3):
-        bounce[k] = pos[k]
     restitution, friction = (
         parameters[RallyParameter.TABLE_RESTITUTION0],
         parameters[RallyParameter.TABLE_FRICTION],
     )
+    pos, vel, _, what, normal = fly_to_touch(pos, vel, spin, LONGEST_FLIGHT, air, no_robot)
+    if launch[KIND] == SERVE and what == OPPONENT_COURT:
+        vel, spin = table_bounce(vel, spin, normal, restitution, friction)
+        pos, vel, _, what, normal = fly_to_touch(pos, vel, spin, LONGEST_FLIGHT, air, no_robot)
+    if what != ROBOT_COURT:
+        return
+    for k in range(3):
+        bounce[k] = pos[k]
     vel, spin = table_bounce(vel, spin, normal, restitution, friction)
     for _ in range(int(LONGEST_FLIGHT / GRID_STEP)):
         before, before_vel = pos, vel
@@ -79,12 +83,12 @@ def _fly_all(
 def unplayed_flight(launches: Array, parameters: Array, flight: Flight) -> tuple[Array, Array]:
     """Return where balls bounce on the robot's court (n, 3) [m], and where they then cross the table's end (n, 3) [m].
 
-    A ball that touches anything before the robot's court has neither (nan). A ball that bounces twice, or drops beside
-    the table, has no arrival (nan).
+    A ball that touches anything before the robot's court, but for a serve's bounce, has neither (nan). A ball that
+    bounces twice, or drops beside the table, has no arrival (nan).
 
     Args:
-        launches: As ``launch.RallyBlock.launches`` (n, 11).
-        parameters: ``randomization.RallyParameter`` of the same rallies (n, 15), for air and table.
+        launches: As ``launch.RallyBlock.launches`` (n, 12).
+        parameters: ``randomization.RallyParameter`` of the same rallies (n, 16), for air and table.
         flight: Model of the aerodynamics.
     """
     bounces, arrivals = np.empty((len(launches), 3)), np.empty((len(launches), 3))

@@ -9,7 +9,7 @@ from common.perception.cholesky import factor
 from common.perception.flight_track import DW, SPIN_SIGMA, Array, BallEstimate
 from common.perception.spin_posterior import TABLE_FRICTION_MEAN, TABLE_FRICTION_SIGMA
 from common.physics.constants import BALL_RADIUS
-from common.physics.flight import SIMPLE, Air, flight_step
+from common.physics.flight import LINEAR, Air, flight_step
 from common.physics.table_bounce import table_bounce
 from common.physics.vec import Vec, scale
 
@@ -27,7 +27,7 @@ def fly_to_table(ball: BallEstimate) -> tuple[float, Vec, Vec]:
     A time longer than ``MAX_HORIZON``: it does not come down within the horizon. A ball that is lower is flown back.
     """
     pos, vel, spin, drag_factor = ball
-    air = Air(drag_factor, 1.0, SIMPLE)
+    air = Air(drag_factor, 1.0, LINEAR)
     elapsed = 0.0
     while elapsed < MAX_HORIZON:
         next_pos, next_vel = flight_step(pos, vel, spin, _STEP, air)
@@ -50,7 +50,7 @@ def fly(ball: BallEstimate, duration: float) -> tuple[Vec, Vec]:
     pos, vel, spin, drag_factor = ball
     steps = max(1, math.ceil(abs(duration) / _STEP))
     for _ in range(steps):
-        pos, vel = flight_step(pos, vel, spin, duration / steps, Air(drag_factor, 1.0, SIMPLE))
+        pos, vel = flight_step(pos, vel, spin, duration / steps, Air(drag_factor, 1.0, LINEAR))
     return pos, vel
 
 

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.jit import kernel
+from common.perception.flight_track import COMING, SERVED
 from common.perception.nominal_motion import (
     MAX_HORIZON,
     MAX_STEP,
@@ -44,7 +45,7 @@ COVARIANCE = (
     10  # of position (p), velocity (v), extra acceleration (e), per axis: pp, pv, pe, vv, ve, ee (18)
 )
 COUNT = 28  # detections accepted since the fit started
-STATE = 29  # trajectory state 0..3
+STATE = 29  # trajectory state 0..3, or SERVED
 TOUCH = 30  # time of the last touch [s]; NO_TOUCH if there was none
 BEFORE_TOUCH = 31  # position, velocity and extra acceleration just before it (9)
 STATE_BEFORE_TOUCH = 40
@@ -250,7 +251,7 @@ def _restart(row: Array, first: Vec, first_moment: float, second: Vec, moment: f
 
 
 @kernel
-def begin_filter(row: Array, moment: float, pos: Vec, sigma: float) -> None:
+def begin_filter(row: Array, moment: float, pos: Vec, sigma: float, state: int) -> None:
     """Begin a track with its first detection.
 
     Args:
@@ -258,8 +259,9 @@ def begin_filter(row: Array, moment: float, pos: Vec, sigma: float) -> None:
         moment: Time stamp [s].
         pos: Of the detection [m].
         sigma: Noise of the detections [m] an axis.
+        state: Trajectory state at the start: ``COMING``, or ``SERVED`` if the opponent serves, which the rules tell.
     """
-    row[STATE], row[STATE_BEFORE_TOUCH], row[TOUCH] = 0.0, 0.0, NO_TOUCH
+    row[STATE], row[STATE_BEFORE_TOUCH], row[TOUCH] = state, state, NO_TOUCH
     _start_fit(row, moment, pos, (FIRST_SPEED, 0.0, 0.0), max(sigma, MIN_SIGMA))
 
 
@@ -291,7 +293,7 @@ def add_detection(row: Array, moment: float, pos: Vec, sigma: float) -> bool:
 
 @kernel
 def estimate_at(row: Array, moment: float) -> tuple[Vec, Vec, int]:
-    """Return position [m], velocity [m/s] and trajectory state 0..3 at any moment, before or after the last detection.
+    """Return position [m], velocity [m/s] and trajectory state at any moment, before or after the last detection.
 
     Args:
         row: (ESTIMATE,).
@@ -327,12 +329,14 @@ def is_guess(row: Array) -> bool:
 
 
 @kernel
-def _track(times: Array, positions: Array, latency: float, sigma: float, out: Array) -> None:
+def _track(
+    times: Array, positions: Array, latency: float, sigma: float, first_state: int, out: Array
+) -> None:
     row = np.zeros(ESTIMATE)
     for k in range(times.shape[0]):
         detection = vec_at(positions[k], 0)
         if k == 0:
-            begin_filter(row, times[0], detection, sigma)
+            begin_filter(row, times[0], detection, sigma, first_state)
         else:
             add_detection(row, times[k], detection, sigma)
         pos, vel, state = estimate_at(row, times[k] + latency)
@@ -341,7 +345,9 @@ def _track(times: Array, positions: Array, latency: float, sigma: float, out: Ar
         out[k, 6] = state
 
 
-def track(times: Array, positions: Array, latency: float = 0.0, sigma: float = 0.002) -> Array:
+def track(
+    times: Array, positions: Array, latency: float = 0.0, sigma: float = 0.002, *, is_serve: bool = False
+) -> Array:
     """Return causal estimates (n, 7) of a recorded ball: position [m], velocity [m/s], trajectory state.
 
     Row k uses detections 0..k, and is the estimate for the moment ``times[k] + latency``.
@@ -351,6 +357,7 @@ def track(times: Array, positions: Array, latency: float = 0.0, sigma: float = 0
         positions: Table frame [m] (n, 3).
         latency: Time from each detection to its estimate [s].
         sigma: Noise of the detections [m] an axis.
+        is_serve: Whether the ball bounces on the server's own court first; its state is ``SERVED`` until then.
     """
     if positions.shape != (len(times), 3) or len(times) == 0:
         raise ValueError(
@@ -367,6 +374,7 @@ def track(times: Array, positions: Array, latency: float = 0.0, sigma: float = 0
         np.ascontiguousarray(positions, np.float64),
         latency,
         sigma,
+        SERVED if is_serve else COMING,
         out,
     )
     return out

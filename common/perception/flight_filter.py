@@ -39,6 +39,7 @@ from common.perception.flight_track import (
     INFORMATION_MATRIX,
     INFORMATION_VECTOR,
     INTERCEPTION,
+    IS_SERVED,
     LIFT,
     MILD_PROBABILITY,
     MOMENT,
@@ -55,6 +56,7 @@ from common.perception.flight_track import (
     PRIOR_VEL,
     RIGHT_SIDE,
     SATURATION,
+    SERVED,
     SOLUTION,
     SPIN,
     SPIN_RATIO,
@@ -107,12 +109,13 @@ def begin_track(
 
     Args:
         track: Written.
-        measurement: Position [m] and velocity [m/s] in its first six numbers.
+        measurement: Position [m], velocity [m/s], and trajectory state ``COMING`` or ``SERVED``.
         moment: Time stamp, on any clock [s].
         position_noise: Sigma of the position an axis [m].
         velocity_noise: Sigma of the velocity an axis [m/s].
     """
     track[:PRIOR_MILD] = 0.0
+    track[IS_SERVED] = 1.0 if measurement[6] == SERVED else 0.0
     update_spin_prior(track)
     track[MOMENT], track[FIT_START] = moment, moment
     track[POS : POS + 6] = measurement[:6]
@@ -317,27 +320,34 @@ def predict_interception(track: Array, now: float) -> None:
         track[MOMENT] - track[FIT_START]
     )  # from the last sample to the interception
     here, speed = ball.pos, ball.vel
+    there, then = here, speed
     spin = ball.spin
     if track[BOUNCED] == 0.0:
-        wait, there, then = fly_to_table(ball)
-        if ahead < wait:
-            here, speed = fly(ball, min(ahead, MAX_HORIZON))
-        if wait > MAX_HORIZON:  # no bounce within the horizon: the prediction ends there
-            until = MAX_HORIZON
-        else:
+        until = 0.0
+        # A serve has another bounce before the one on the robot's court
+        for bounces_left in range(2 if track[IS_SERVED] == 1.0 else 1, 0, -1):
+            wait, there, then = fly_to_table(ball)
+            if until <= ahead < until + wait:
+                here, speed = fly(ball, min(ahead - until, MAX_HORIZON))
+            if wait > MAX_HORIZON:  # no bounce within the horizon: the prediction ends there
+                until += MAX_HORIZON
+                break
             falling = (then[0], then[1], min(then[2], -0.1))
             rising, spin = table_bounce(
                 falling,
-                scale(track[SPIN_RATIO], ball.spin),
+                # After the first bounce of a serve the spin is the law's, and not what a flight shows of it
+                scale(track[SPIN_RATIO], ball.spin) if until == 0.0 else ball.spin,
                 (0.0, 0.0, 1.0),
                 TABLE_RESTITUTION0_MEAN,
                 TABLE_FRICTION_MEAN,
             )
-            after = BallEstimate(there, rising, spin, ball.drag_factor)
-            if ahead >= wait:
-                here, speed = fly(after, ahead - wait)
-            until = wait + INTERCEPTION_AFTER
-            there, then = fly(after, INTERCEPTION_AFTER)
+            ball = BallEstimate(there, rising, spin, ball.drag_factor)
+            until += wait
+            if bounces_left == 1:
+                if ahead >= until:
+                    here, speed = fly(ball, ahead - until)
+                until += INTERCEPTION_AFTER
+                there, then = fly(ball, INTERCEPTION_AFTER)
     else:
         here, speed = fly(ball, ahead)
         there, then = fly(ball, until)

@@ -2,7 +2,7 @@
 
 A nominal ball starts at the first sample, with nominal air and spin w_0. The true ball differs from it by
 
-    dp(t) = dp_0 + dv_0 E(t) + K dw x X(t) + k D(t)          K = (rho A/2m) 1.067 r
+    dp(t) = dp_0 + dv_0 E(t) + K dw x X(t) + k D(t)          K = (rho A/2m) C_L/S r
     dv(t) =        dv_0 E'(t) + K dw x X'(t) + k D'(t)
 
 X' is the displacement of the nominal ball, D' is the change of its velocity by drag, and E' is the share of an
@@ -20,11 +20,14 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, BALL_RADIUS
-from common.physics.flight import SIMPLE, SIMPLE_DRAG, SIMPLE_LIFT_MAX, SIMPLE_LIFT_SLOPE, Air, flight_step
+from common.physics.flight import LINEAR, LINEAR_DRAG, LINEAR_LIFT_MAX, LINEAR_LIFT_SLOPE, Air, flight_step
 from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, vec_at
 from common.task.observation import ExpectedSpin
 
 Array = npt.NDArray[np.float64]
+
+# Trajectory states of samples before the hit: 1 after the bounce on the robot's court
+COMING, SERVED = 0, 4  # on its way to it; a serve on its way to the server's own court
 
 UNKNOWNS = 10  # dp_0 (3), dv_0 (3), dw / SPIN_SIGMA (3), k / DRAG_SIGMA
 DV, DW, DRAG = 3, 6, 9  # where dv_0, dw and k start
@@ -59,7 +62,8 @@ SPIN_RATIO, SPIN_RATIO_SIGMA = MILD_PROBABILITY + 1, MILD_PROBABILITY + 2  # exp
 # These stay from ball to ball
 PRIOR_MILD, CHANGE_PROBABILITY = MILD_PROBABILITY + 3, MILD_PROBABILITY + 4  # ``SpinPrior``
 POSTERIOR_MILD = MILD_PROBABILITY + 5  # probability that the last ball with a predicted bounce was a mild one
-TRACK = MILD_PROBABILITY + 6  # numbers in a row
+IS_SERVED = MILD_PROBABILITY + 6  # 1: the ball has not yet bounced on the server's own court
+TRACK = MILD_PROBABILITY + 7  # numbers in a row
 PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and interception
 
 SPIN_SIGMA = 50.0  # [rad/s] prior an axis; balls of the preset `paper` have 45
@@ -69,10 +73,10 @@ MAX_DRAG_DEVIATION = 0.5  # [-] bound of the estimated drag factor's deviation f
 
 # Spin / visible spin of mild and of strong balls, mean and sigma [-]: measured at the bounce of balls of the presets
 # `paper` and `strong`
-_MILD_RATIO, _STRONG_RATIO = (1.2, 0.2), (3.3, 1.0)
-LIFT = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS  # K
-SATURATION = SIMPLE_LIFT_MAX / (SIMPLE_LIFT_SLOPE * BALL_RADIUS)  # [1/m] spin / speed at which lift saturates
-_DRAG_RATE = AIR_FACTOR * SIMPLE_DRAG  # [1/m]
+_MILD_RATIO, _STRONG_RATIO = (1.05, 0.3), (2.3, 0.9)
+LIFT = AIR_FACTOR * LINEAR_LIFT_SLOPE * BALL_RADIUS  # K
+SATURATION = LINEAR_LIFT_MAX / (LINEAR_LIFT_SLOPE * BALL_RADIUS)  # [1/m] spin / speed at which lift saturates
+_DRAG_RATE = AIR_FACTOR * LINEAR_DRAG  # [1/m]
 
 
 class SpinPrior(NamedTuple):
@@ -86,7 +90,7 @@ SPIN_PRIORS: Final[Mapping[ExpectedSpin, SpinPrior]] = {
     "mild": SpinPrior(1.0, 1.0),
     "mixed": SpinPrior(0.5, 1.0),
     "strong": SpinPrior(0.0, 1.0),
-    "learnt": SpinPrior(0.8, 0.01),
+    "learnt": SpinPrior(0.8, 0.03),
 }
 """Priors by the setting ``expected_spin`` (ADR-0030)."""
 
@@ -155,7 +159,7 @@ def advance(track: Array, h: float) -> None:
     """Fly the nominal ball for ``h`` seconds, and integrate along its flight."""
     v = vec_at(track, VEL)
     drag_factor = track[NOMINAL_DRAG]
-    q, u = flight_step(vec_at(track, POS), v, vec_at(track, NOMINAL_SPIN), h, Air(drag_factor, 1.0, SIMPLE))
+    q, u = flight_step(vec_at(track, POS), v, vec_at(track, NOMINAL_SPIN), h, Air(drag_factor, 1.0, LINEAR))
     before, after = norm(v), norm(u)
     # Drag reduces a deviation of velocity to exp(-drag |v| h) of it
     left = math.exp(-0.5 * h * _DRAG_RATE * drag_factor * (before + after))

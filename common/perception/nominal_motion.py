@@ -8,6 +8,7 @@ import math
 from typing import Final
 
 from common.jit import kernel
+from common.perception.flight_track import COMING, SERVED
 from common.physics.constants import (
     AIR_FACTOR,
     BALL_RADIUS,
@@ -16,7 +17,7 @@ from common.physics.constants import (
     TABLE_HALF_WIDTH,
     TABLE_RESTITUTION0,
 )
-from common.physics.flight import SIMPLE, SIMPLE_LIFT_SLOPE, Air, acceleration
+from common.physics.flight import LINEAR, LINEAR_LIFT_SLOPE, Air, acceleration
 from common.physics.table_bounce import table_bounce
 from common.physics.vec import Vec, add, axpy, cross, dot, norm, scale, sub
 
@@ -51,9 +52,9 @@ def _turn_extra(extra: Vec, vel: Vec, later: Vec) -> Vec:
 def glide(pos: Vec, vel: Vec, extra: Vec, h: float) -> BallMotion:
     """Return the ball after ``h`` seconds (negative: before) without touches: one midpoint step."""
     none = (0.0, 0.0, 0.0)
-    start = add(acceleration(vel, none, Air(1.0, 1.0, SIMPLE)), extra)
+    start = add(acceleration(vel, none, Air(1.0, 1.0, LINEAR)), extra)
     middle = axpy(0.5 * h, start, vel)
-    rate = add(acceleration(middle, none, Air(1.0, 1.0, SIMPLE)), _turn_extra(extra, vel, middle))
+    rate = add(acceleration(middle, none, Air(1.0, 1.0, LINEAR)), _turn_extra(extra, vel, middle))
     later = axpy(h, rate, vel)
     return axpy(h, middle, pos), later, _turn_extra(extra, vel, later)
 
@@ -84,7 +85,7 @@ def time_to_table(pos: Vec, vel: Vec, after: Vec, h: float) -> float:
 def bounce(vel: Vec, extra: Vec) -> tuple[Vec, Vec]:
     """Return velocity and extra acceleration after the nominal table, for the spin that ``extra`` implies."""
     square = max(dot(vel, vel), 1.0)
-    per_spin = AIR_FACTOR * SIMPLE_LIFT_SLOPE * BALL_RADIUS
+    per_spin = AIR_FACTOR * LINEAR_LIFT_SLOPE * BALL_RADIUS
     spin = scale(1.0 / (per_spin * square), cross(vel, extra))
     after, spin_after = table_bounce(vel, spin, (0.0, 0.0, 1.0), TABLE_RESTITUTION0, TABLE_FRICTION)
     drag = dot(extra, vel) / square
@@ -94,9 +95,11 @@ def bounce(vel: Vec, extra: Vec) -> tuple[Vec, Vec]:
 
 @kernel
 def state_after_bounce(state: int, pos: Vec) -> int:
-    """Return the trajectory state 0..3 after a bounce on the table at ``pos``."""
-    if state == 0 and pos[0] < 0.0:
+    """Return the trajectory state 0..3, or ``SERVED``, after a bounce on the table at ``pos``."""
+    if state == COMING and pos[0] < 0.0:
         return 1
+    if state == SERVED and pos[0] > 0.0:
+        return COMING
     if state == 2 and pos[0] > 0.0:
         return 3
     return state

@@ -19,7 +19,13 @@ from common.task.states import OUTCOME_OFFSET, Outcome, State
 CONTACT_FORCE_SCALE: Final = 50.0  # [N] F_c at which a body's collision penalty saturates
 FARTHEST: Final = 1.0e3  # [m] a rally whose ball is farther away ends: the simulation has failed
 
-_TAU_0, _TAU_01, _TAU_1, _TAU_12, _TAU_2, _TAU_23, _TAU_3, _TAU_30 = (int(s) for s in State)
+_TAU_0, _TAU_1, _TAU_2, _TAU_23, _TAU_3, _TAU_30, _TAU_S = (
+    int(s)
+    for s in (
+        *(State.TAU_0, State.TAU_1, State.TAU_2, State.TAU_23, State.TAU_3, State.TAU_30),
+        State.TAU_S,
+    )
+)
 _RETURNED, _TIME_OUT = int(Outcome.RETURNED), int(Outcome.TIME_OUT)
 # Columns of the reward table and of its terms (reward.FEATURES, reward.TERMS)
 _CONSTANT, _REACH, _SPEED, _AIM, _LANDING = range(5)
@@ -158,7 +164,7 @@ def pay(
         terms[_LANDING_TERM] = rows[_TAU_3, _CONSTANT] + rows[_TAU_3, _LANDING] / (
             (1.0 + miss * miss) * (1.0 + miss * miss)
         )
-    if not (bounced or hit or landed or state == _TAU_0):
+    if not (bounced or hit or landed or state in (_TAU_0, _TAU_S)):
         reach = _near(norm(sub(pos, racket_pose(rules.chain, joints).centre)))
         terms[_APPROACH_TERM] = rules.rate_scale * rows[state, _REACH] * reach
         terms[_AIM_TERM] = rules.rate_scale * rows[state, _AIM] * _near(norm(sub(pos, target)))

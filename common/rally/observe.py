@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.jit import kernel
-from common.perception.flight_track import PREDICTED, PRESENT, SPIN
+from common.perception.flight_track import PREDICTED, PRESENT, SERVED, SPIN
 from common.physics.chain import Chain, quaternion_of, racket_state
 from common.physics.constants import GRID_STEP
 from common.rally.state import STAMP, Array, Integers, Rallies
@@ -79,9 +79,9 @@ def observe(
         o[30] = rallies.parameters[b, RallyParameter.TARGET_X]
         o[31] = rallies.parameters[b, RallyParameter.TARGET_Y]
         s = int(rallies.measurement[b, 6])
-        o[32] = 2.0 * s / 3.0 - 1.0
+        o[32] = 2.0 * s / 3.0 - 1.0 if s != SERVED else -1.0
         for j in range(4):
-            o[33 + j] = 1.0 if j == s else 0.0
+            o[33 + j] = 1.0 if j == s else 0.0  # all 0: a serve before its first bounce
         at = 37
         if flags.spin != _SPIN_HIDDEN:
             for j in range(3):

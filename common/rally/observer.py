@@ -31,7 +31,8 @@ class BallSample:
 
     pos: tuple[float, float, float]  # m
     vel: tuple[float, float, float]  # m/s
-    state: int  # 0 coming, 1 bounced on the robot's court, 2 hit, 3 landed
+    # 0 coming, 1 bounced on the robot's court, 2 hit, 3 landed, 4 served and not yet bounced on the server's own court
+    state: int
     moment: float  # [s] time stamp, on the robot's clock
     is_guess: bool = False  # the camera filter has too few detections yet: ``camera_filter.is_guess``
 

@@ -9,12 +9,13 @@ from common.jit import inlined, kernel
 from common.perception.camera import DETECTION_BUFFER, READ, TAKEN, detect_along_flight, detection_row
 from common.perception.camera_filter import add_detection, begin_filter, estimate_at, is_guess
 from common.perception.flight_filter import add_measurement, begin_track, predict_interception
-from common.perception.flight_track import PRESENT
+from common.perception.flight_track import COMING, IS_SERVED, PRESENT, SERVED
 from common.physics.constants import GRID_STEP
 from common.physics.fly import Segment
 from common.physics.vec import Vec
 from common.rally.state import RING, STAMP, Rallies
 from common.task.counter_rng import Stream, normal_pair, uniform
+from common.task.launch_presets import SERVE
 from common.task.randomization import RallyParameter, RandomizationProfile
 
 Array = npt.NDArray[np.float64]
@@ -66,7 +67,8 @@ def filter_measurement(rallies: Rallies, b: int, profile: RandomizationProfile) 
         detection = detection_row(buffer, int(buffer[READ]))
         pos = (detection[1], detection[2], detection[3])
         if buffer[READ] == 0.0:  # the camera detects the launch itself
-            begin_filter(row, detection[0], pos, profile.camera_noise)
+            is_serve = rallies.parameters[b, RallyParameter.KIND] == SERVE
+            begin_filter(row, detection[0], pos, profile.camera_noise, SERVED if is_serve else COMING)
             detection[4] = 1.0
         elif detection[0] + latency > now + 1e-9:
             break
@@ -97,7 +99,7 @@ def update_flight_filter(
 
     Args:
         track: Written.
-        measurement: Position [m], velocity [m/s], trajectory state 0..3.
+        measurement: Position [m], velocity [m/s], trajectory state 0..3 or ``SERVED``.
         stamp: Time stamp of the measurement [s].
         now: Time now [s].
         is_first: Whether it is the flight's first measurement.
@@ -106,10 +108,12 @@ def update_flight_filter(
         position_noise: Standard deviation of the measured position per axis [m].
         velocity_noise: Standard deviation of the measured velocity per axis [m/s].
     """
-    if is_first or (is_guess and measurement[6] == 0.0):
+    comes = measurement[6] == COMING
+    # The flight after a serve's first bounce is a new one: the bounce has changed its velocity and its spin
+    if is_first or (is_guess and (comes or measurement[6] == SERVED)) or (comes and track[IS_SERVED] == 1.0):
         begin_track(track, measurement, stamp, position_noise, velocity_noise)
         predict_interception(track, now)
-    elif measurement[6] <= 1.0:
+    elif measurement[6] <= 1.0 or measurement[6] == SERVED:
         add_measurement(track, measurement, stamp, measurement[6] == 1.0, position_noise, velocity_noise)
         predict_interception(track, now)
     else:  # the ball was hit: the track is over

@@ -19,7 +19,7 @@ Flags = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
 RING: Final = MAX_LATENCY_STEPS + 1  # true samples kept: one a grid step
-SAMPLE: Final = 7  # numbers in a sample: position [m], velocity [m/s], trajectory state 0..3
+SAMPLE: Final = 7  # numbers in a sample: position [m], velocity [m/s], trajectory state 0..3, or SERVED
 STAMP: Final = SAMPLE  # column of ``Rallies.measurement``: when the sample was taken [s since launch]
 NO_SAMPLE: Final = -1.0  # trajectory state of a row of a recorded track after its end
 NO_TRACKS: Final = new_tracks(0)
@@ -31,7 +31,7 @@ class Rallies(NamedTuple):
     ball: Array  # (B, 9) position [m], velocity [m/s], spin [rad/s]
     state: Integers  # (B,) states.State
     seed: npt.NDArray[np.uint64]  # (B,)
-    parameters: Array  # (B, 15) randomization.RallyParameter
+    parameters: Array  # (B, 16) randomization.RallyParameter
     clock: Integers  # (B,) grid steps since launch
     rounds_left: Integers  # (B,) rallies left in this episode, with the one in play
     landing_bonus_paid: Flags  # (B,) the bonus for the predicted landing point is paid once a rally
@@ -68,7 +68,7 @@ class Rules(NamedTuple):
     """The constants of a step."""
 
     transitions: Integers  # states.transition_table()
-    rewards: Array  # (8, 5) reward.reward_table()[stage - 1]
+    rewards: Array  # (10, 5) reward.reward_table()[stage - 1]
     landing_scale: float  # [m]
     landing_bonus: float  # weight of the bonus for the predicted landing point; 0 in stages 1 and 2
     landing_bonus_scale: float  # [m]

@@ -23,6 +23,8 @@ from common.rally.finish import apply_touch, finish_step
 from common.rally.hit_correction import BOUNCE, FRESH, write_contact, write_departure
 from common.rally.sensing import advance_clock, record_detections, update_perception
 from common.rally.state import RING, Array, FlightResult, Integers, Rallies, RobotMotion, Rules, Step
+from common.task.launch import DRAG_FACTOR, KIND, LIFT_FACTOR
+from common.task.launch_presets import SERVE
 from common.task.randomization import (
     RallyParameter,
     RandomizationProfile,
@@ -35,8 +37,8 @@ from common.task.states import State
 MAX_SPEED_REWARDED: Final = 10.0  # [m/s]
 _TOUCHES_A_STEP: Final = 8  # a ball that touches more often within 5 ms is squeezed between two obstacles
 
-_TAU_0, _TAU_1, _TAU_2, _TAU_23, _TAU_3 = (
-    int(s) for s in (State.TAU_0, State.TAU_1, State.TAU_2, State.TAU_23, State.TAU_3)
+_TAU_0, _TAU_1, _TAU_2, _TAU_23, _TAU_3, _TAU_S = (
+    int(s) for s in (State.TAU_0, State.TAU_1, State.TAU_2, State.TAU_23, State.TAU_3, State.TAU_S)
 )
 
 
@@ -47,15 +49,18 @@ def launch_rally(rallies: Rallies, b: int, launch: Array, seed: int, profile: Ra
     Args:
         rallies: Row b is written.
         b: Row.
-        launch: (11,) position, velocity, spin, drag factor, lift factor: the columns of ``task.launch``.
+        launch: (12,) position, velocity, spin, drag factor, lift factor, kind: the columns of ``task.launch``.
         seed: Seed of the rally. Its parameters, target and noise follow from it.
         profile: Ranges of the parameters.
     """
     for k in range(9):
         rallies.ball[b, k] = launch[k]
-    rallies.state[b] = _TAU_0
+    state = _TAU_S if launch[KIND] == SERVE else _TAU_0
+    rallies.state[b] = state
     rallies.seed[b] = seed
-    draw_parameters(seed, launch[9], launch[10], profile, rallies.parameters[b])
+    draw_parameters(
+        seed, launch[DRAG_FACTOR], launch[LIFT_FACTOR], launch[KIND], profile, rallies.parameters[b]
+    )
     rallies.clock[b] = 0
     rallies.caught[b] = False
     rallies.over[b] = False
@@ -66,7 +71,7 @@ def launch_rally(rallies: Rallies, b: int, launch: Array, seed: int, profile: Ra
     for row in range(RING):
         for k in range(6):
             rallies.true_sample_ring[b, row, k] = launch[k]
-        rallies.true_sample_ring[b, row, 6] = 0.0
+        rallies.true_sample_ring[b, row, 6] = float(state // 2)
     if rallies.camera_state.shape[0] > 0:
         start = (launch[0], launch[1], launch[2])
         begin_detections(rallies.camera_state[b, :DETECTION_BUFFER], seed, start, profile)
@@ -86,17 +91,17 @@ def snap_to_recorded_track(path: Array, step: int, state: int, pos: Vec, vel: Ve
     bounced, the ball is left alone.
 
     Args:
-        path: Samples on the grid from the launch on: position, velocity, 0 before the bounce and 1 after it;
-            ``NO_SAMPLE`` after the track's end (n, 7).
+        path: Samples on the grid from the launch on: position, velocity, and ``SERVED`` before a serve's first bounce,
+            0 before the bounce on the robot's court and 1 after it; ``NO_SAMPLE`` after the track's end (n, 7).
         step: Grid steps since the launch.
         state: Trajectory state now.
         pos: Position by physics [m].
         vel: Velocity by physics [m/s].
     """
-    if step >= path.shape[0] or state >= _TAU_2:
+    if step >= path.shape[0] or _TAU_2 <= state < _TAU_S:
         return pos, vel
     row = path[step]
-    if row[6] != (1.0 if state >= _TAU_1 else 0.0):
+    if row[6] != float(state // 2):
         return pos, vel
     return (row[0], row[1], row[2]), (row[3], row[4], row[5])
 
@@ -260,6 +265,6 @@ def launch_rallies(
     seeds: npt.NDArray[np.uint64],
     profile: RandomizationProfile,
 ) -> None:
-    """Put rallies ``launches`` (n, 11) with ``seeds`` (n,) on ``rows`` (n,)."""
+    """Put rallies ``launches`` (n, 12) with ``seeds`` (n,) on ``rows`` (n,)."""
     for k in range(rows.shape[0]):
         launch_rally(rallies, rows[k], launches[k], seeds[k], profile)

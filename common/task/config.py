@@ -31,12 +31,22 @@ class PlayConditions(BaseModel):
         description="what the robot measures of the ball: cheap: its true state, late and noisy; full: the estimate of "
         "the camera filter, from the detections of a simulated camera",
     )
+    flight: FlightName = Field(
+        "full",
+        description="aerodynamics of the ball: full: coefficients that depend on speed and spin; simple: constant "
+        "drag, and lift that is linear in spin up to a limit",
+    )
 
 
 class MatchConditions(PlayConditions):
     """Conditions of a match against balls from a launch preset."""
 
-    launch: PresetName = Field("paper", description="launch preset of the balls")
+    launch: PresetName = Field(
+        "paper",
+        description="balls: paper: mild ones; strong: to 300 rad/s; mixed: half of each; match: strokes of elite "
+        "players; elite: the hardest of these (15-20 m/s, over 600 rad/s); serve; all: every kind, and in training "
+        "each the more often, the more often it is lost",
+    )
     rounds: int = Field(
         1,
         ge=1,
@@ -73,7 +83,6 @@ class TaskConfig(MatchConditions):
     control_rate_hz: Literal[25, 50, 100, 200] = Field(
         50, description="control steps a second", json_schema_extra={"unit": "Hz"}
     )
-    flight: FlightName = Field("simple", description="aerodynamics of the ball")
     carry_over: float = Field(
         0.5,
         ge=0,

@@ -31,6 +31,7 @@ class Stream(IntEnum):
     RESET = 9
     DETECTION = 10
     OUTLIER = 11
+    KIND = 12
 
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)

@@ -44,7 +44,14 @@ OBSERVATION: tuple[Part, ...] = (
     Part(
         "trajectory_state", 1, "-", -1.0, 1.0, "2s/3 - 1, where s is 0 launched, 1 bounced, 2 hit, 3 landed"
     ),
-    Part("continuous_state", 4, "-", 0.0, 1.0, "one-hot over tau_01, tau_12, tau_23, tau_30"),
+    Part(
+        "continuous_state",
+        4,
+        "-",
+        0.0,
+        1.0,
+        "one-hot over tau_01, tau_12, tau_23, tau_30; all 0: a serve before its first bounce",
+    ),
 )
 """The paper's observation, in its order. The paper prints "racket position (7)"; only 3 gives the sum of 37."""
 
@@ -153,8 +160,8 @@ class ObservationConfig(BaseModel):
         "mild",
         description="how fast balls are expected to spin. The flight hides strong spin, because lift saturates. mild: "
         "to 100 rad/s; mixed: half of them to 100 rad/s, half to 300 rad/s; strong: to 300 rad/s; learnt: as the "
-        "opponent's earlier balls did, for play in which all balls of an environment come from one opponent; not for "
-        "launch preset mixed",
+        "opponent's earlier balls did, for play in which the balls of an environment come from one opponent after the "
+        "other; not for matches with launch preset mixed",
     )
     prediction: bool = Field(
         True,

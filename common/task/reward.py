@@ -33,6 +33,9 @@ R: dict[State, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] =
     State.TAU_23: (_0,                            _0,                            (0.0,  0.0, 0.0, 1.0, 0.0)),
     State.TAU_3:  (_0,                            _0,                            (30.0, 0.0, 0.0, 0.0, 40.0)),
     State.TAU_30: (_0,                            _0,                            _0),
+    # not in the paper: a serve on its way to the server's own court is a ball that comes
+    State.TAU_S:  (_0,                            _0,                            _0),
+    State.TAU_S0: ((0.0,  1.0, 0.0, 0.0, 0.0),    (0.0,  0.25, 0.0, 0.0, 0.0),   (0.0,  0.1, 0.0, 0.0, 0.0)),
 }
 # fmt: on
 
@@ -90,5 +93,5 @@ PAPER_REWARD = RewardConfig(reference_rate_hz=200.0, collision=0.1, landing_scal
 
 
 def reward_table() -> npt.NDArray[np.float64]:
-    """Return R for the kernels (3, 8, 5): entry [stage - 1, state, feature]."""
+    """Return R for the kernels (3, 10, 5): entry [stage - 1, state, feature]."""
     return np.array([[R[state][stage] for state in State] for stage in range(3)])

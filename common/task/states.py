@@ -3,6 +3,7 @@
 The states follow the ball (the paper, section III-A): tau_0 launch, tau_01 on its way to the robot, tau_1 bounce on the
 robot's court, tau_12 the robot catches, tau_2 racket contact, tau_23 on its way back, tau_3 landing on the opponent's
 court, tau_30 the opponent catches. tau_i is an instant and lasts one control step. tau_ij continues until a touch.
+A serve has two more (ours): tau_s it is served, tau_s0 on its way to the server's own court. Its bounce there is tau_0.
 """
 
 from enum import IntEnum
@@ -24,6 +25,8 @@ class State(IntEnum):
     TAU_23 = 5
     TAU_3 = 6
     TAU_30 = 7
+    TAU_S = 8
+    TAU_S0 = 9
 
 
 class Outcome(IntEnum):
@@ -48,6 +51,11 @@ _S, _O = State, Outcome
 
 # fmt: off
 TRANSITIONS: dict[State, dict[Touch, State | Outcome]] = {
+    State.TAU_S0: {
+        Touch.NONE: _S.TAU_S0, Touch.ROBOT_COURT: _O.BAD_LAUNCH, Touch.OPPONENT_COURT: _S.TAU_0,
+        Touch.NET: _O.BAD_LAUNCH, Touch.RACKET: _O.VOLLEY, Touch.BODY: _O.BODY,
+        Touch.EDGE: _O.BAD_LAUNCH, Touch.FLOOR: _O.BAD_LAUNCH, Touch.OUT: _O.BAD_LAUNCH,
+    },
     State.TAU_01: {
         Touch.NONE: _S.TAU_01, Touch.ROBOT_COURT: _S.TAU_1, Touch.OPPONENT_COURT: _O.BAD_LAUNCH,
         Touch.NET: _O.BAD_LAUNCH, Touch.RACKET: _O.VOLLEY, Touch.BODY: _O.BODY,
@@ -77,13 +85,14 @@ CONTINUES_AS: dict[State, State] = {
     State.TAU_1: State.TAU_12,
     State.TAU_2: State.TAU_23,
     State.TAU_3: State.TAU_30,
+    State.TAU_S: State.TAU_S0,
 }
 
 OUTCOME_OFFSET = 100  # tells outcomes from states in ``transition_table``
 
 
 def transition_table() -> npt.NDArray[np.int64]:
-    """Return TRANSITIONS for the kernels (8, 9): entry [state, touch] is a state, or OUTCOME_OFFSET + outcome."""
+    """Return TRANSITIONS for the kernels (10, 9): entry [state, touch] is a state, or OUTCOME_OFFSET + outcome."""
     table = np.full((len(State), len(Touch)), -1, dtype=np.int64)
     for state in State:
         for touch, value in TRANSITIONS[CONTINUES_AS.get(state, state)].items():

@@ -39,6 +39,7 @@ class Player:
         horizon: T, control steps of one block.
         seed: Of the action noise; differs from actor to actor.
         clock: Returns seconds; measures the duration of each phase.
+        note: Called with rallies that ended.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class Player:
         horizon: int,
         seed: int,
         clock: Callable[[], float] = time.perf_counter,
+        note: Callable[[FinishedRallies], None] = lambda _: None,
     ) -> None:
         torch.set_num_threads(1)  # a second thread makes small products slower and uses the learner's core
         self._teacher = teacher_of(task, experience.teacher)
@@ -66,6 +68,7 @@ class Player:
         self._noise = torch.Generator()
         self._seed = seed
         self._clock = clock
+        self._note = note
         self._obs: Floats | None = None
         self._shape = (horizon, envs)
 
@@ -129,6 +132,7 @@ class Player:
                 final_index.append((t * envs + step.ended[cut]).astype(np.int32))
             if step.finished.rows.size:
                 finished.append(step.finished)
+                self._note(step.finished)
             inference, simulation = inference + (acted - started), simulation + (self._clock() - acted)
         return Rollout(
             run=snapshot.run,

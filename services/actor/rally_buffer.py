@@ -1,16 +1,30 @@
-"""The actor's stock of valid rallies: a first-in first-out ring; each rally is used once."""
+"""The actor's stock of valid rallies: a first-in first-out ring for each kind of ball; each rally is used once."""
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from common.comms.messages import RallyBatch
-from common.env.rally_env import Launches
+from common.env.rally_env import FinishedRallies, Launches
 from common.task.config import TaskConfig
-from common.task.launch import DRAG_FACTOR, LIFT_FACTOR, POSITION, SPIN, VELOCITY, Purpose, draw_rallies
+from common.task.launch import (
+    DRAG_FACTOR,
+    KIND,
+    LAUNCH_SIZE,
+    LIFT_FACTOR,
+    POSITION,
+    SPIN,
+    VELOCITY,
+    Purpose,
+    draw_rallies,
+)
+from common.task.launch_presets import Kind
+from services.actor.ball_mix import BallMix
 
 # Far beyond every preset: a ball outside these limits could break the simulation.
 LIMITS: Final = (
@@ -18,7 +32,11 @@ LIMITS: Final = (
     ("velocity", VELOCITY, -60.0, 60.0),  # m/s
     ("spin", SPIN, -3000.0, 3000.0),  # rad/s
     ("drag and lift factor", slice(DRAG_FACTOR, LIFT_FACTOR + 1), 0.0, 5.0),
+    ("kind", slice(KIND, KIND + 1), 0.0, float(max(Kind))),
 )
+
+
+FAR: Final = 4096  # batches: far more than arrive out of order
 
 
 def launch_fault(batch: RallyBatch) -> str:
@@ -46,8 +64,11 @@ class BufferCounts:
 class RallyBuffer:
     """Rallies in the order of arrival; when empty, random launches, counted and flagged as unvalidated.
 
+    Where the launch preset has several kinds of ball, ``ball_mix`` decides which an environment gets. Rallies of a kind
+    that is played less often than it arrives are pushed out, oldest first.
+
     Args:
-        capacity: Target number of rallies in stock: the number of the actor's environments. The batch that fills the
+        capacity: Target number of rallies in stock, and the number of the actor's environments. The batch that fills a
             ring is kept whole, so that batches of any size lose nothing.
         task: Launch preset, randomization and flight of the fallback.
         seed: Of the fallback launches.
@@ -58,7 +79,8 @@ class RallyBuffer:
         self, capacity: int, task: TaskConfig, seed: int, refill: Callable[[], None] = lambda: None
     ) -> None:
         self.counts = BufferCounts()
-        self._ring: deque[tuple[np.ndarray, np.uint64]] = deque()
+        self._rings: list[deque[tuple[np.ndarray, np.uint64]]] = [deque() for _ in Kind]
+        self._mix = BallMix(task.launch, capacity, seed)
         self._capacity = capacity
         self._task, self._seed = task, seed
         self._refill = refill
@@ -66,37 +88,48 @@ class RallyBuffer:
         self._last: dict[tuple[str, int, int], int] = {}
 
     def __len__(self) -> int:
-        return len(self._ring)
+        return sum(map(len, self._rings))
 
     @property
     def room(self) -> int:
-        """Number of rallies missing in stock. While it is above 0, one more batch pushes no rally out."""
-        return max(0, self._capacity - len(self._ring))
+        """Number of rallies missing in stock, of the kind that lacks most. Of one kind, above 0, a batch fits whole."""
+        wanted = (math.ceil(share * self._capacity) for share in self._mix.shares.tolist())
+        missing: list[int] = [want - len(ring) for want, ring in zip(wanted, self._rings, strict=True)]
+        return max(0, *missing)
+
+    def note(self, finished: FinishedRallies) -> None:
+        """Take note of rallies that ended: kinds that are lost more often are played more often."""
+        self._mix.note(finished)
 
     def put(self, batch: RallyBatch) -> None:
         """Add a batch. A repeated batch is counted and ignored."""
         source = (batch.source, batch.incarnation, batch.shard)
         last = self._last.get(source)
         if last is not None:
-            if batch.sequence <= last:
+            if 0 <= last - batch.sequence < FAR:
                 self.counts.repeated += 1
                 return
-            self.counts.gaps += batch.sequence - last - 1
+            # A number far away is a forged one, or the true one after it: it must not hide the batches that follow
+            self.counts.gaps += min(max(batch.sequence - last - 1, 0), FAR)
         self._last[source] = batch.sequence
-        self._ring.extend(zip(batch.rallies, batch.seeds, strict=True))
         self.counts.received += len(batch.seeds)
-        while len(self._ring) > self._capacity - 1 + len(batch.seeds):
-            self._ring.popleft()
-            self.counts.overflowed += 1
+        kinds = batch.rallies[:, KIND].astype(np.int64)
+        for rally, seed, kind in zip(batch.rallies, batch.seeds, kinds, strict=True):
+            self._rings[kind].append((rally, seed))
+        for ring, arrived in zip(self._rings, np.bincount(kinds, minlength=len(Kind)), strict=True):
+            while len(ring) > self._capacity - 1 + arrived:
+                ring.popleft()
+                self.counts.overflowed += 1
 
-    def take(self, count: int) -> Launches:
-        """Return ``count`` launches, oldest first. Never blocks."""
-        while (before := len(self._ring)) < count:
+    def take(self, rows: npt.NDArray[np.int64]) -> Launches:
+        """Return a launch for each of the environments ``rows`` (n,), of each kind the oldest first. Never blocks."""
+        count = rows.size
+        while (before := len(self)) < count:
             self._refill()
-            if len(self._ring) == before:
+            if len(self) == before:
                 break
-        stocked = [self._ring.popleft() for _ in range(min(count, len(self._ring)))]
-        launches = np.empty((count, 11))
+        stocked = [self._next(int(row)) for row in rows[: min(count, len(self))]]
+        launches = np.empty((count, LAUNCH_SIZE))
         seeds = np.empty(count, np.uint64)
         for row, (launch, seed) in enumerate(stocked):
             launches[row], seeds[row] = launch, seed
@@ -106,6 +139,10 @@ class RallyBuffer:
             self.counts.underruns += missing
         self.counts.consumed += len(stocked)
         return Launches(launches, seeds, np.arange(count) < len(stocked))
+
+    def _next(self, row: int) -> tuple[np.ndarray, np.uint64]:
+        in_stock = np.array([len(ring) > 0 for ring in self._rings])
+        return self._rings[self._mix.next_kind(row, in_stock)].popleft()
 
     def _draw(self, launches: np.ndarray, seeds: np.ndarray) -> None:
         block = draw_rallies(

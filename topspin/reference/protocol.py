@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from common.comms import keys, messages
+from common.comms.budgets import BUDGETS, KIB
 from common.comms.wire import Wire
 
 _SIMPLE = {str: "text", int: "integer", float: "number", bool: "true or false", bytes: "bytes"}
@@ -36,7 +37,8 @@ def markdown() -> str:
         "a msgpack array `[type, version, {field: value}]`.",
         "Integers of the header are 32 bit, little endian.",
         "An array is `[dtype, shape, bytes]`.",
-        "A receiver refuses a message whose type, version, dtype, shape or range differs.",
+        "A receiver refuses a message whose type, version, dtype, shape or range differs, or that is over its budget.",
+        "Text is one line of printable characters; ids have the form of a key's part.",
         "",
         "## Messages",
         "",
@@ -60,6 +62,9 @@ def _is_part(kind: Any) -> bool:
 def _section(kind: type[Any]) -> list[str]:
     hints, comments = typing.get_type_hints(kind, include_extras=True), _comments(kind)
     lines = ["", f"### {kind.__name__}, version {kind.VERSION}", "", _plain(kind.__doc__), ""]
+    if kind.__name__ in BUDGETS:
+        budget = BUDGETS[kind.__name__]
+        lines += [f"At most {budget.bytes // KIB:,} KiB and {budget.items:,} items.", ""]
     lines += ["| field | type | unit | shape | meaning |", "|---|---|---|---|---|"]
     for field in dataclasses.fields(kind):
         wire = _wire(hints[field.name])

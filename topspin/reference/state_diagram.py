@@ -7,6 +7,7 @@ from common.physics.touch import Touch
 from common.task.states import CONTINUES_AS, TRANSITIONS, Outcome, State
 
 MEANINGS: Final = {
+    State.TAU_S0: "is served",
     State.TAU_01: "ball comes",
     State.TAU_12: "has bounced",
     State.TAU_23: "flies back",
@@ -29,7 +30,9 @@ def svg() -> str:
     ]
     for index, state in enumerate(columns):
         lines += _state(state, 20 + _PITCH * index)
-    lines += [_arrow(f"M95 32V{_TOP - 2}"), _text(95, 22, f"{_name(State.TAU_0)}: launch", "#444")]
+    for start, word in ((State.TAU_S, "serve"), (State.TAU_0, "stroke")):
+        x = 20 + _PITCH * columns.index(CONTINUES_AS[start]) + _WIDTH // 2
+        lines += [_arrow(f"M{x} 32V{_TOP - 2}"), _text(x, 22, f"{_name(start)}: {word}", "#444")]
     return "\n".join([*lines, "</svg>"]) + "\n"
 
 

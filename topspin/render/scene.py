@@ -30,6 +30,7 @@ TRAIL: Final[dict[int, TrailColour]] = {
     1: TrailColour((0.95, 0.90, 0.25), "bounced"),  # tau_12
     2: TrailColour((0.90, 0.38, 0.05), "hit by the robot"),  # tau_23
     3: TrailColour((0.90, 0.55, 0.78), "landed"),  # tau_30
+    4: TrailColour((0.62, 0.60, 0.95), "served"),  # tau_s0
 }
 SPIN_RGB: Final = (1.0, 1.0, 1.0)
 TARGET_RGB: Final = (0.0, 0.72, 0.52)

@@ -101,8 +101,7 @@ class Results:
 def evaluation_task(policy: Policy, config: ReportConfig, rounds: int) -> TaskConfig:
     """Return the task that a policy is measured on: its contract's, under the report's conditions."""
     task = match_task(policy.contract, config, config.expected_spin)
-    # All policies play the same flights: the model with which the rallies were drawn.
-    return task.model_copy(update={"flight": "simple", "rounds": rounds})
+    return task.model_copy(update={"rounds": rounds})
 
 
 def results(runs: Sequence[Run], config: ReportConfig, on_tick: Callable[[], None] = lambda: None) -> Results:

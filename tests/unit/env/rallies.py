@@ -23,7 +23,8 @@ class Deck:
         self.block = block
         self.next, self.stride, self.validated = first, stride, validated
 
-    def take(self, count: int) -> Launches:
+    def take(self, rows: npt.NDArray[np.int64]) -> Launches:
+        count = rows.size
         index = (self.next + self.stride * np.arange(count)) % len(self.block.seeds)
         self.next += self.stride * count
         return Launches(

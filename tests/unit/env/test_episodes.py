@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.env.rally_env import EnvStep, RallyEnv
-from common.physics.flight import SIMPLE, Air
+from common.physics.flight import FULL, Air
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.task.config import TaskConfig
 from common.task.launch import draw_rallies
@@ -28,7 +28,7 @@ def test_the_time_limit_truncates_and_the_final_observation_has_the_ball_at_that
         assert env.step(hold(env)).ended.size == 0
     launch = env._source.block.launches[0]
     p, v, _, _, _ = fly_to_touch(
-        as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9]), 0.2, Air(1, 1, SIMPLE), NO_ROBOT
+        as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9]), 0.2, Air(1, 1, FULL), NO_ROBOT
     )
     step = env.step(hold(env))
 

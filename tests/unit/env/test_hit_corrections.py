@@ -11,7 +11,7 @@ from common.env.rally_env import EnvStep, RallyEnv
 from common.env.robot import RobotBatch
 from common.physics.chain import racket_pose
 from common.physics.constants import BALL_RADIUS, TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
-from common.physics.flight import SIMPLE
+from common.physics.flight import FULL
 from common.policy.folder import load_policy
 from common.rally.hit_correction import (
     BACK,
@@ -260,10 +260,10 @@ def played(actions: np.ndarray | None = None, collision: str = "tailored") -> Pl
             parts = [tuple(hit[i:j]) for i, j in ((9, 16), (16, 23), (0, 3), (3, 6), (6, 9))]
             hit_at[b], results[b] = (
                 t,
-                hit_result(CHAIN, *parts, rubber_of(parameters[b]), air_of(parameters[b], SIMPLE)),
+                hit_result(CHAIN, *parts, rubber_of(parameters[b]), air_of(parameters[b], FULL)),
             )
             left = [tuple(hit[i : i + 3]) for i in range(LEFT_POS, HIT, 3)]
-            results[b, :2] = landing_and_clearance(*left, air_of(parameters[b], SIMPLE))[:2]
+            results[b, :2] = landing_and_clearance(*left, air_of(parameters[b], FULL))[:2]
         for k, b in enumerate(step.hit_corrections.rows):
             if is_first[b]:
                 found[b] = step.hit_corrections.corrections[k]

@@ -7,7 +7,7 @@ from common.env.mujoco_ball import HARD, RUBBER, STEP
 from common.env.rally_env import EnvStep, RallyEnv
 from common.physics.chain import racket_pose
 from common.physics.constants import BALL_INERTIA, BALL_MASS, BALL_RADIUS
-from common.physics.flight import SIMPLE, Air
+from common.physics.flight import FULL, Air
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.robot.chain_of import chain_of
 from common.task.config import TaskConfig
@@ -153,9 +153,7 @@ def test_the_flight_agrees_with_the_tailored_flight_within_2_mm():
         flown += 0.02
         for row, launch in enumerate(block.launches):
             pos, vel, spin = as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9])
-            p, _, t, what, _ = fly_to_touch(
-                pos, vel, spin, flown, Air(launch[9], launch[10], SIMPLE), NO_ROBOT
-            )
+            p, _, t, what, _ = fly_to_touch(pos, vel, spin, flown, Air(launch[9], launch[10], FULL), NO_ROBOT)
             if not what and env.rallies.state[row] == State.TAU_01:
                 assert t == pytest.approx(flown)
                 np.testing.assert_allclose(env.rallies.ball[row, :3], p, atol=0.002)

@@ -5,7 +5,7 @@ import pytest
 
 from common.env.rally_env import Launches, RallyEnv
 from common.physics.constants import GRID_STEP
-from common.physics.flight import SIMPLE, Air
+from common.physics.flight import FULL, Air
 from common.physics.fly import NO_ROBOT, fly_step, fly_to_touch
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import ROBOT_COURT
@@ -29,8 +29,8 @@ class Replay:
     def __init__(self, launches: list[Launches]) -> None:
         self.launches = list(launches)
 
-    def take(self, count: int) -> Launches:
-        assert count == 1
+    def take(self, rows) -> Launches:
+        assert rows.size == 1
         return self.launches.pop(0)
 
 
@@ -41,8 +41,8 @@ class LoggedDeck(Deck):
         super().__init__(*args, **options)
         self.log: list[Launches] = []
 
-    def take(self, count: int) -> Launches:
-        self.log.append(super().take(count))
+    def take(self, rows) -> Launches:
+        self.log.append(super().take(rows))
         return self.log[-1]
 
 
@@ -123,7 +123,7 @@ def test_a_rally_flies_as_it_was_generated_and_bounces_where_it_was_validated():
     bounced = 0
     for row, (launch, parameters) in enumerate(zip(block.launches, drawn, strict=True)):
         pos, vel, spin = as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9])
-        air = Air(launch[9], launch[10], SIMPLE)
+        air = Air(launch[9], launch[10], FULL)
         touched, before, flown, what, normal = fly_to_touch(pos, vel, spin, 2.0, air, NO_ROBOT)
         after, turned = table_bounce(
             before,
@@ -162,7 +162,7 @@ def test_a_ball_flies_the_same_at_every_control_rate(rate):
         env.step(hold(env))
     launch = env._source.block.launches[0]
     p, _, _, _, _ = fly_to_touch(
-        as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9]), 0.1, Air(1, 1, SIMPLE), NO_ROBOT
+        as_vec(launch[:3]), as_vec(launch[3:6]), as_vec(launch[6:9]), 0.1, Air(1, 1, FULL), NO_ROBOT
     )
 
     np.testing.assert_array_equal(env.rallies.ball[0, :3], p)

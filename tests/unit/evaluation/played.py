@@ -16,7 +16,7 @@ def make_played(rows, **columns):
         "seeds": np.arange(n, dtype=np.uint64),
         "returns": np.zeros(n, np.float32),
         "rounds": np.ones(n, np.int32),
-        "launches": np.tile([1.0, 0, 0.3, -5, 0, 0, 0, 0, 50, 1, 1], (n, 1)),
+        "launches": np.tile([1.0, 0, 0.3, -5, 0, 0, 0, 0, 50, 1, 1, 0], (n, 1)),
         "landings": np.full((n, 2), NAN, np.float32),
         "targets": np.tile([0.7, 0.0], (n, 1)),
         "bounces": np.tile([-0.7, 0.0], (n, 1)),
@@ -40,7 +40,8 @@ def random_played(n, seed=0):
     """Return rallies of all kinds: launches, outcomes and places at random."""
     rng = np.random.default_rng(seed)
     rows = [(RETURNED, OUT, MISSED)[k] for k in rng.integers(3, size=n)]
-    launches = rng.uniform(-1, 1, (n, 11)) * [1, 1, 1, 1, 4, 1, 200, 200, 200, 1, 1]
+    launches = rng.uniform(-1, 1, (n, 12)) * [1, 1, 1, 1, 4, 1, 200, 200, 200, 1, 1, 0]
+    launches[:, 11] = rng.integers(6, size=n)
     launches[:, 3] = rng.uniform(-9, -3, n)
     arrivals = rng.uniform([-1.37, -1.2, -0.2], [-1.37, 1.2, 0.6], (n, 3))
     arrivals[rng.random(n) < 0.1] = NAN

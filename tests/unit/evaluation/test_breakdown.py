@@ -5,7 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from common.evaluation.breakdown import BREAKDOWNS, KINDS, breakdown, on_grid, spin_kinds, survival, table
+from common.evaluation.breakdown import (
+    BREAKDOWNS,
+    SPIN_KINDS,
+    breakdown,
+    on_grid,
+    spin_kinds,
+    survival,
+    table,
+)
 from common.evaluation.measures import wilson
 from common.task.states import Outcome
 from tests.unit.evaluation.played import MISSED, NAN, OUT, RETURNED, make_played, random_played
@@ -85,7 +93,7 @@ def test_every_rally_is_in_one_bin_of_every_breakdown():
 def test_a_spin_has_the_name_of_its_largest_part(velocity, spin, kind):
     played = make_played([MISSED], launches=[[1, 0, 0.3, *velocity, *spin, 1, 1]])
 
-    assert KINDS[spin_kinds(played)[0]] == kind
+    assert SPIN_KINDS[spin_kinds(played)[0]] == kind
 
 
 def test_the_top_of_a_topspin_ball_moves_forward():
@@ -94,7 +102,7 @@ def test_the_top_of_a_topspin_ball_moves_forward():
         played.launches[:, 6:9], (0.0, 0.0, 1.0)
     )  # velocity of the ball's top about its centre / r
     forward = (top[:, :2] * played.launches[:, 3:5]).sum(axis=1)
-    kinds = np.array(KINDS)[spin_kinds(played)]
+    kinds = np.array(SPIN_KINDS)[spin_kinds(played)]
 
     assert (kinds == "topspin").sum() > 20
     assert (forward[kinds == "topspin"] > 0).all()
@@ -121,6 +129,7 @@ def test_survival_is_the_product_of_the_rounds_rates_and_its_sum_the_length():
     ]
     assert found["by_round"][0]["return_rate_ci"] == [round(bound, 4) for bound in wilson(2, 4)]
     assert found["rally_length_mean"] == 0.75
+    assert found["rally_length_median"] == 1  # half of the rallies have one ball or more, a quarter two
 
 
 def test_a_round_that_the_sets_end_cuts_does_not_shorten_rallies():

@@ -36,7 +36,7 @@ def test_each_rally_is_given_once_in_order_and_then_filler_that_is_not_counted()
     filler = draw_rallies(2, seed=1, purpose=Purpose.FALLBACK)
     source = FixedRallies(rallies, filler)
 
-    dealt = [source.take(count) for count in (2, 2, 4, 1)]
+    dealt = [source.take(np.arange(count)) for count in (2, 2, 4, 1)]
 
     seeds = np.concatenate([d.seeds for d in dealt])
     np.testing.assert_array_equal(seeds[:5], rallies.seeds)
@@ -122,9 +122,9 @@ def test_launches_targets_and_flights_are_those_of_the_rallies_beside_them():
     for k, seed in enumerate(played.seeds):
         row = int(np.flatnonzero(rallies.seeds == seed)[0])
         parameters = np.empty(RALLY_PARAMETERS)
-        drag, lift = rallies.launches[row, 9:]
-        draw_parameters(seed, drag, lift, PROFILES["standard"], parameters)
-        bounce, arrival = unplayed_flight(rallies.launches[row : row + 1], parameters[None], Flight.SIMPLE)
+        drag, lift, kind = rallies.launches[row, 9:]
+        draw_parameters(seed, drag, lift, kind, PROFILES["standard"], parameters)
+        bounce, arrival = unplayed_flight(rallies.launches[row : row + 1], parameters[None], Flight.FULL)
         np.testing.assert_array_equal(played.launches[k], rallies.launches[row])
         np.testing.assert_array_equal(played.targets[k], parameters[8:10])
         np.testing.assert_array_equal(played.bounces[k], bounce[0, :2])
@@ -220,4 +220,4 @@ def test_a_match_is_the_contracts_task_under_the_matchs_conditions():
 
     assert (task.launch, task.randomization, task.rounds, task.perception) == ("strong", "hard", 5, "full")
     assert task.observation == OBSERVATION.model_copy(update={"expected_spin": "learnt"})
-    assert (task.robot, task.control_rate_hz, task.flight) == ("rails", 50, "simple")
+    assert (task.robot, task.control_rate_hz, task.flight) == ("rails", 50, "full")

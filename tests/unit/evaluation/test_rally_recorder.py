@@ -22,7 +22,8 @@ class Once:
     def __init__(self, block):
         self.block = block
 
-    def take(self, count):
+    def take(self, rows):
+        count = rows.size
         return Launches(self.block.launches[:count], self.block.seeds[:count], np.ones(count, np.bool_))
 
 

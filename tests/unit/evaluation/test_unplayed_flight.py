@@ -21,7 +21,9 @@ def fly(pos, vel, spin=(0.0, 0.0, 0.0)):
     """Return bounce and arrival of a ball without drag and lift, on a table with e_0 0.98 and mu 0.25."""
     parameters = np.zeros((1, RALLY_PARAMETERS))
     parameters[0, 2:4] = 0.98, 0.25
-    bounces, arrivals = unplayed_flight(np.array([[*pos, *vel, *spin, 0.0, 0.0]]), parameters, Flight.SIMPLE)
+    bounces, arrivals = unplayed_flight(
+        np.array([[*pos, *vel, *spin, 0.0, 0.0, 0.0]]), parameters, Flight.SIMPLE
+    )
     return bounces[0], arrivals[0]
 
 
@@ -65,7 +67,7 @@ def test_the_environments_balls_bounce_there():
     config: TaskConfig = QUIET.model_copy(update={"randomization": "standard", "control_rate_hz": 200})
     env = RallyEnv(16, config, Deck(block))
     env.reset()
-    expected, _ = unplayed_flight(block.launches, env.rallies.parameters, Flight.SIMPLE)
+    expected, _ = unplayed_flight(block.launches, env.rallies.parameters, Flight.FULL)
     found = np.full((16, 3), NAN)
     before = env.rallies.ball[:, :3].copy()
     for _ in range(120):

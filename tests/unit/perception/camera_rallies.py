@@ -16,14 +16,15 @@ from common.perception.camera import (
     detection_row,
 )
 from common.perception.camera_filter import ESTIMATE, add_detection, begin_filter, estimate_at
+from common.perception.flight_track import COMING
 from common.physics.constants import GRID_STEP
-from common.physics.flight import SIMPLE
+from common.physics.flight import FULL
 from common.physics.fly import NO_ROBOT, RobotPath, Segment, fly_step
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, ROBOT_COURT
 from common.task.config import TaskConfig
 from common.task.counter_rng import Stream, between
-from common.task.launch import DRAG_FACTOR, LIFT_FACTOR, draw_rallies
+from common.task.launch import DRAG_FACTOR, KIND, LIFT_FACTOR, draw_rallies
 from common.task.randomization import (
     PROFILES,
     RALLY_PARAMETERS,
@@ -61,8 +62,8 @@ def _play_rally(
 ) -> None:
     """Fly a rally without a robot. If ``has_hit``, a hit at 0.15 to 0.3 s after its bounce returns the ball."""
     parameters = np.empty(RALLY_PARAMETERS)
-    draw_parameters(seed, record[DRAG_FACTOR], record[LIFT_FACTOR], profile, parameters)
-    air = air_of(parameters, SIMPLE)
+    draw_parameters(seed, record[DRAG_FACTOR], record[LIFT_FACTOR], record[KIND], profile, parameters)
+    air = air_of(parameters, FULL)
     buffer, row = np.zeros(DETECTION_BUFFER), np.zeros(ESTIMATE)
     pos, vel = (record[0], record[1], record[2]), (record[3], record[4], record[5])
     spin = (record[6], record[7], record[8])
@@ -106,7 +107,7 @@ def _play_rally(
             detection = detection_row(buffer, int(buffer[READ]))
             place = (detection[1], detection[2], detection[3])
             if buffer[READ] == 0.0:
-                begin_filter(row, detection[0], place, profile.camera_noise)
+                begin_filter(row, detection[0], place, profile.camera_noise, COMING)
                 detection[4] = 1.0
             elif detection[0] + latency > now + 1e-9:
                 break

@@ -5,7 +5,7 @@ import pytest
 
 from common.perception.camera import DETECTIONS, MAX_RATE_HZ, detection_position, detection_time
 from common.physics.constants import GRID_STEP
-from common.physics.flight import SIMPLE, Air
+from common.physics.flight import FULL, Air
 from common.physics.fly import NO_ROBOT, fly_step
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE
@@ -35,7 +35,7 @@ def detections_of(played, row: int) -> np.ndarray:
 def true_position(record: np.ndarray, parameters: np.ndarray, moment: float) -> tuple[float, ...]:
     """Return the ball's position after flight in steps of half a millisecond, with a shorter last step."""
     pos, vel, spin = (tuple(record[k : k + 3].tolist()) for k in (0, 3, 6))
-    air = Air(record[9], record[10], SIMPLE)
+    air = Air(record[9], record[10], FULL)
     left = moment
     while left > 1e-12:
         pos, vel, flown, what, normal = fly_step(pos, vel, spin, min(left, 5e-4), air, NO_ROBOT, 0.0)
@@ -59,7 +59,9 @@ def test_a_detection_shows_the_ball_at_its_own_moment_also_in_a_grid_step_with_a
     parameters = np.empty(RALLY_PARAMETERS)
     checked = 0
     for row in range(20):
-        draw_parameters(block.seeds[row], block.launches[row, 9], block.launches[row, 10], SHARP, parameters)
+        draw_parameters(
+            block.seeds[row], block.launches[row, 9], block.launches[row, 10], 0.0, SHARP, parameters
+        )
         for detection in detections_of(played, row)[::3]:
             true = true_position(block.launches[row], parameters, detection[0])
 
@@ -115,7 +117,7 @@ def test_in_a_burst_all_detections_are_lost():
     block, played = draw_rallies(50, seed=0), camera_rallies(50, profile=profile)
     parameters = np.empty(RALLY_PARAMETERS)
     for row in range(50):
-        draw_parameters(block.seeds[row], 1.0, 1.0, profile, parameters)
+        draw_parameters(block.seeds[row], 1.0, 1.0, 0.0, profile, parameters)
         stamps = detections_of(played, row)[1:, 0]
         start, end = parameters[RallyParameter.BURST_START], parameters[RallyParameter.BURST_END]
 

@@ -18,7 +18,8 @@ from common.perception.camera_filter import (
     estimate_at,
     track,
 )
-from common.physics.flight import SIMPLE, Air, flight_step
+from common.perception.flight_track import COMING
+from common.physics.flight import LINEAR, Air, flight_step
 from common.physics.table_bounce import table_bounce
 from common.task.randomization import PROFILES
 from tests.unit.perception.camera_rallies import camera_rallies, errors_of
@@ -34,7 +35,7 @@ def fly(pos, vel, moments, spin=NO_SPIN, step=5e-4) -> np.ndarray:
     for moment in moments:
         while now < moment - 1e-12:
             h = min(step, moment - now)
-            pos, vel = flight_step(pos, vel, spin, h, Air(1.0, 1.0, SIMPLE))
+            pos, vel = flight_step(pos, vel, spin, h, Air(1.0, 1.0, LINEAR))
             now += h
             if pos[2] < 0.02 and vel[2] < 0.0:
                 vel, spin = table_bounce(vel, spin, (0.0, 0.0, 1.0), 0.98, 0.25)
@@ -51,7 +52,7 @@ def stamps(count: int, jitter: float = 0.0007, seed: int = 0) -> np.ndarray:
 def followed(moments: np.ndarray, positions: np.ndarray, sigma: float = SIGMA) -> np.ndarray:
     """Return the row after all detections."""
     row = np.zeros(ESTIMATE)
-    begin_filter(row, moments[0], tuple(positions[0]), sigma)
+    begin_filter(row, moments[0], tuple(positions[0]), sigma, COMING)
     for moment, pos in zip(moments[1:], positions[1:], strict=True):
         add_detection(row, moment, tuple(pos), sigma)
     return row
@@ -145,7 +146,7 @@ def hit_ball(seed: int = 0) -> tuple[np.ndarray, np.ndarray, float]:
     moments = stamps(80, seed=seed)
     first = fly((0.0, 0.0, 0.25), (-4.0, 0.3, -0.5), moments[:50])
     hit = moments[49] + 0.002
-    pos, _ = flight_step(tuple(first[-1, :3]), tuple(first[-1, 3:]), NO_SPIN, 0.002, Air(1.0, 1.0, SIMPLE))
+    pos, _ = flight_step(tuple(first[-1, :3]), tuple(first[-1, 3:]), NO_SPIN, 0.002, Air(1.0, 1.0, LINEAR))
     second = fly(pos, (6.0, -0.5, 1.5), moments[50:] - hit)
     truth = np.concatenate([first, second])
     return moments, truth, hit
@@ -229,7 +230,7 @@ def test_the_estimate_is_finite_for_any_detections(seed):
 
 def test_detections_out_of_order_are_ignored():
     row = np.zeros(ESTIMATE)
-    begin_filter(row, 0.1, (0.0, 0.0, 0.3), SIGMA)
+    begin_filter(row, 0.1, (0.0, 0.0, 0.3), SIGMA, COMING)
     before = row.copy()
 
     assert not add_detection(row, 0.1, (0.0, 0.0, 0.3), SIGMA)

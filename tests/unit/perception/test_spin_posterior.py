@@ -17,7 +17,7 @@ from common.perception.spin_posterior import (
     spin_after_bounce,
 )
 from common.physics.table_bounce import table_bounce
-from common.task.launch_presets import PRESETS
+from common.task.launch_presets import KINDS, Kind
 
 UP = (0.0, 0.0, 1.0)
 BEFORE = (-5.0, 0.8, -2.5)  # m/s
@@ -204,10 +204,9 @@ def test_a_spin_outside_the_prior_is_found_if_the_ball_rolls():
     assert abs(found[2]) < 350.0
 
 
-def test_spheres_are_those_of_the_launch_presets():
-    assert PRESETS["paper"].spin_radii == (MILD_RADIUS, MILD_RADIUS)
-    assert PRESETS["strong"].spin_radii == (STRONG_RADIUS, STRONG_RADIUS)
-    assert PRESETS["mixed"].spin_radii == (MILD_RADIUS, STRONG_RADIUS)
+def test_spheres_are_those_of_the_kinds_of_ball():
+    assert KINDS[Kind.PAPER].spin_radius == MILD_RADIUS
+    assert KINDS[Kind.STRONG].spin_radius == STRONG_RADIUS
 
 
 def test_points_are_spread_evenly():

@@ -49,7 +49,7 @@ FRICTION = np.array([60.0, 90.0, 1.6, 1.6, 0.8, 0.4, 0.2])
 
 def make_parameters(seed=0) -> np.ndarray:
     parameters = np.empty(RALLY_PARAMETERS)
-    draw_parameters(np.uint64(seed), 1.0, 1.0, PROFILES["standard"], parameters)
+    draw_parameters(np.uint64(seed), 1.0, 1.0, 0.0, PROFILES["standard"], parameters)
     return parameters
 
 

@@ -13,6 +13,7 @@ from common.physics.flight import SIMPLE
 from common.rally.state import Rallies, RobotMotion, Rules, Step, allocate
 from common.rally.step import launch_rallies, play_step
 from common.robot.chain_of import chain_of
+from common.task.launch_presets import Kind
 from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
 from common.task.reward import PAPER_REWARD, RewardConfig, reward_table
 from common.task.states import Outcome, State, transition_table
@@ -84,8 +85,9 @@ def make_launch(
     spin: Sequence[float] = (0.0, 0.0, 0.0),
     drag: float = 0.0,
     lift: float = 0.0,
+    kind: int = Kind.PAPER,
 ) -> Array:
-    return np.array([*pos, *vel, *spin, drag, lift])
+    return np.array([*pos, *vel, *spin, drag, lift, kind])
 
 
 def begin(

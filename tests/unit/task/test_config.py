@@ -10,7 +10,13 @@ from common.task.observation import PAPER_OBSERVATION, ObservationConfig
 from common.task.reward import PAPER_REWARD, RewardConfig
 
 MATCH = MatchConditions(
-    randomization="hard", perception="full", launch="match", rounds=5, collision="original", time_limit_s=9.0
+    randomization="hard",
+    perception="full",
+    flight="simple",
+    launch="match",
+    rounds=5,
+    collision="original",
+    time_limit_s=9.0,
 )
 
 
@@ -19,7 +25,6 @@ def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else(
         robot="usst",
         rubber="long_pips",
         control_rate_hz=100,
-        flight="full",
         carry_over=0.25,
         reset_spread=0.2,
         reward=PAPER_REWARD,
@@ -33,7 +38,6 @@ def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else(
         "robot",
         "rubber",
         "control_rate_hz",
-        "flight",
         "carry_over",
         "reset_spread",
         "reward",
@@ -44,9 +48,11 @@ def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else(
 
 def test_a_task_under_conditions_of_play_keeps_balls_and_rules():
     task = TaskConfig(launch="strong", rounds=3, collision="original", time_limit_s=4.0)
-    played = task.under(PlayConditions(randomization="off", perception="full"))
+    played = task.under(PlayConditions(randomization="off", perception="full", flight="simple"))
 
-    assert played == task.model_copy(update={"randomization": "off", "perception": "full"})
+    assert played == task.model_copy(
+        update={"randomization": "off", "perception": "full", "flight": "simple"}
+    )
 
 
 def test_settings_of_an_evaluation_that_are_no_conditions_are_not_taken():
@@ -64,7 +70,7 @@ def test_the_default_task_plays_paper_balls_once_at_50_hz_with_standard_randomiz
     assert (task.randomization, task.perception, task.flight, task.collision) == (
         "standard",
         "cheap",
-        "simple",
+        "full",
         "tailored",
     )
     assert (task.time_limit_s, task.carry_over, task.reset_spread) == (2.5, 0.5, 0.1)

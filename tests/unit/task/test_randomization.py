@@ -20,7 +20,7 @@ OFF = PROFILES["off"]
 def draw(seeds: int, profile: RandomizationProfile) -> np.ndarray:
     rows = np.empty((seeds, RALLY_PARAMETERS))
     for seed in range(seeds):
-        draw_parameters(np.uint64(seed), 1.1, 0.9, profile, rows[seed])
+        draw_parameters(np.uint64(seed), 1.1, 0.9, 3.0, profile, rows[seed])
     return rows
 
 
@@ -35,17 +35,17 @@ def test_parameters_are_a_function_of_the_seed(profile):
 
 
 @every_profile
-def test_drag_and_lift_are_those_of_the_launch(profile):
-    np.testing.assert_array_equal(
-        draw(5, PROFILES[profile])[:, [RallyParameter.DRAG, RallyParameter.LIFT]], [[1.1, 0.9]] * 5
-    )
+def test_drag_lift_and_kind_are_those_of_the_launch(profile):
+    columns = [RallyParameter.DRAG, RallyParameter.LIFT, RallyParameter.KIND]
+
+    np.testing.assert_array_equal(draw(5, PROFILES[profile])[:, columns], [[1.1, 0.9, 3.0]] * 5)
 
 
 @every_profile
 def test_drag_and_lift_factors_stay_below_2_as_the_search_for_touches_assumes(profile):
     ranges = PROFILES[profile]
 
-    assert max(*ranges.drag_factor, *ranges.lift_factor) < 2.0
+    assert max(ranges.drag_factor[1], ranges.lift_factor[1] + ranges.backspin_lift) < 2.0
 
 
 @every_profile
@@ -190,7 +190,7 @@ def test_a_lost_sample_repeats_the_last_one():
 def test_in_a_burst_the_last_sample_before_it_is_held():
     profile = OFF._replace(burst_share=1.0, burst_samples=(15.0, 15.0))
     row = np.empty(RALLY_PARAMETERS)
-    draw_parameters(np.uint64(1), 0.0, 0.0, profile, row)
+    draw_parameters(np.uint64(1), 0.0, 0.0, 0.0, profile, row)
     played = play_high_ball(profile)
     moment = CONTROL_PERIOD * (1 + np.arange(len(played.measurement)))
     lost = (moment >= row[RallyParameter.BURST_START]) & (moment < row[RallyParameter.BURST_END])

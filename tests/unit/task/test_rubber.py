@@ -33,7 +33,7 @@ every_profile = pytest.mark.parametrize("name", PROFILES)
 def drawn(profile: RandomizationProfile, seeds: int = 500) -> np.ndarray:
     rows = np.empty((seeds, RALLY_PARAMETERS))
     for seed in range(seeds):
-        draw_parameters(np.uint64(seed), 1.0, 1.0, profile, rows[seed])
+        draw_parameters(np.uint64(seed), 1.0, 1.0, 0.0, profile, rows[seed])
     return rows
 
 

@@ -90,6 +90,7 @@ def test_only_legal_touches_advance_a_rally_and_only_to_the_next_state():
     }
 
     assert advances == {
+        (State.TAU_S0, Touch.OPPONENT_COURT, State.TAU_0),
         (State.TAU_01, Touch.ROBOT_COURT, State.TAU_1),
         (State.TAU_12, Touch.RACKET, State.TAU_2),
         (State.TAU_23, Touch.OPPONENT_COURT, State.TAU_3),

@@ -35,9 +35,9 @@ class Dealer:
         self.block = draw_rallies(1600, seed=5)
         self.dealt = 0
 
-    def take(self, count):
-        rows = np.arange(self.dealt, self.dealt + count)
-        self.dealt += count
+    def take(self, rows):
+        rows = self.dealt + np.arange(rows.size)
+        self.dealt += rows.size
         return Launches(self.block.launches[rows], self.block.seeds[rows], rows % 3 > 0)
 
 

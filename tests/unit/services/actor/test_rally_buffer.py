@@ -3,7 +3,7 @@ import pytest
 
 from common.comms.messages import RallyBatch
 from common.task.config import TaskConfig
-from common.task.launch import Purpose, draw_rallies
+from common.task.launch import LAUNCH_SIZE, Purpose, draw_rallies
 from common.task.launch_presets import PRESETS
 from services.actor.rally_buffer import RallyBuffer, launch_fault
 
@@ -12,7 +12,7 @@ OFF = TaskConfig(randomization="off")
 
 def make_batch(sequence=0, count=4, first=0, **changes):
     """Return a batch whose rallies are numbered by their seeds."""
-    rallies = np.zeros((count, 11))
+    rallies = np.zeros((count, LAUNCH_SIZE))
     rallies[:, 0] = np.arange(first, first + count) / 1000
     values = {
         "source": "generator-0",
@@ -38,7 +38,7 @@ def test_each_rally_is_taken_once_in_the_order_of_arrival():
     buffer.put(make_batch(0, count=4, first=0))
     buffer.put(make_batch(1, count=4, first=4))
 
-    taken = [buffer.take(3) for _ in range(2)] + [buffer.take(2)]
+    taken = [buffer.take(np.arange(3)) for _ in range(2)] + [buffer.take(np.arange(2))]
 
     np.testing.assert_array_equal(np.concatenate([t.seeds for t in taken]), np.arange(8))
     np.testing.assert_allclose(np.concatenate([t.launches[:, 0] for t in taken]), np.arange(8) / 1000)
@@ -50,8 +50,8 @@ def test_when_empty_launches_are_random_flagged_counted_and_never_a_generators()
     buffer = make_buffer()
     buffer.put(make_batch(count=2))
 
-    taken = buffer.take(5)
-    more = buffer.take(3)
+    taken = buffer.take(np.arange(5))
+    more = buffer.take(np.arange(3))
 
     assert taken.validated.tolist() == [True, True, False, False, False]
     assert not more.validated.any()
@@ -68,9 +68,9 @@ def test_it_is_refilled_until_there_is_enough_or_nothing_more_arrives():
     waiting = [make_batch(i, count=2, first=2 * i) for i in range(4)]
     buffer = make_buffer(refill=lambda: buffer.put(waiting.pop(0)) if waiting else None)
 
-    assert buffer.take(5).validated.all()
+    assert buffer.take(np.arange(5)).validated.all()
     assert len(waiting) == 1
-    assert buffer.take(4).validated.sum() == 3
+    assert buffer.take(np.arange(4)).validated.sum() == 3
 
 
 @pytest.mark.parametrize("size", [3, 8, 50])
@@ -81,7 +81,7 @@ def test_batches_of_any_size_fill_the_stock_without_losing_a_rally(size):
         while buffer.room > 0:
             buffer.put(make_batch(sequence, count=size, first=size * sequence))
             sequence += 1
-        seen.extend(buffer.take(5).seeds.tolist())
+        seen.extend(buffer.take(np.arange(5)).seeds.tolist())
 
     assert seen == list(range(150))
     assert (buffer.counts.overflowed, buffer.counts.underruns, buffer.counts.gaps) == (0, 0, 0)
@@ -94,7 +94,7 @@ def test_arrivals_while_it_is_full_push_the_oldest_out_and_are_counted():
 
     # it holds up to a batch more than its capacity
     assert buffer.counts.overflowed == 5
-    assert buffer.take(7).seeds.tolist() == list(range(5, 12))
+    assert buffer.take(np.arange(7) % 4).seeds.tolist() == list(range(5, 12))
     assert buffer.counts.received == buffer.counts.overflowed + buffer.counts.consumed
 
 
@@ -119,3 +119,13 @@ def test_generators_launches_pass_and_impossible_ones_do_not(preset):
     assert launch_fault(make_batch(count=200, rallies=wild, seeds=block.seeds)) == (
         "velocity 1e+09; allowed: -60 to 60"
     )
+
+
+def test_a_forged_number_does_not_hide_the_batches_that_follow():
+    buffer = make_buffer(capacity=64)
+    for sequence in (0, 2**62, 1, 2):
+        buffer.put(make_batch(sequence, count=2, first=2 * (sequence % 1000)))
+
+    assert buffer.counts.received == 8
+    assert buffer.counts.repeated == 0
+    assert buffer.counts.gaps <= 4096

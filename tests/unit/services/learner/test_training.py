@@ -224,7 +224,7 @@ def test_only_the_newest_checkpoints_are_kept(tmp_path):
         (lambda path: path.unlink(), "no checkpoint"),
         (lambda path: path.write_bytes(b"rubbish"), "not readable"),
         (lambda path: path.write_bytes(path.read_bytes()[:-100]), "not readable"),
-        (lambda path: reword(path, '"format": 2', '"format": 9'), "has format 9; allowed is 2"),
+        (lambda path: reword(path, '"format": 3', '"format": 9'), "has format 9; allowed is 3"),
     ],
 )
 def test_an_unusable_checkpoint_is_refused_with_one_line(tmp_path, damage, message):

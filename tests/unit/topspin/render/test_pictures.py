@@ -44,7 +44,7 @@ def nearest(colours, pixel):
 
 def test_every_state_outcome_and_camera_has_an_entry():
     assert set(TRAIL) == {state // 2 for state in State}
-    assert len({colour.rgb for colour in TRAIL.values()}) == len({c.label for c in TRAIL.values()}) == 4
+    assert len({colour.rgb for colour in TRAIL.values()}) == len({c.label for c in TRAIL.values()}) == 5
     assert set(OUTCOME_WORDS) == set(Outcome)
     assert set(CAMERAS) == set(get_args(CameraName))
 

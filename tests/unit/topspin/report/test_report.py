@@ -246,7 +246,7 @@ def test_policies_are_measured_on_the_reports_task_not_their_training_task(tmp_p
 
     task = evaluation_task(policy, ReportConfig(), 1)
     assert (task.randomization, task.collision, task.rounds) == ("standard", "tailored", 1)
-    assert (task.control_rate_hz, task.flight) == (50, "simple")
+    assert (task.control_rate_hz, task.flight) == (50, "full")
     assert task.observation == policy.contract.task.observation
 
 
