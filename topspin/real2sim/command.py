@@ -19,12 +19,15 @@ from common.evaluation.match import match_task, play_match
 from common.evaluation.measures import MatchResult, measures
 from common.evaluation.rally_recorder import RecordedRally, record_rallies
 from common.policy.box import policy_folder
+from common.policy.contract import Contract
 from common.policy.folder import load_policy
 from common.service.config import ConfigError, load
 from common.service.log import set_up_logging
 from common.service.process import DONE
+from common.task.config import TaskConfig
 from topspin.real2sim.config import Real2SimConfig
 from topspin.real2sim.dataset import Recorded, evenly, read
+from topspin.real2sim.formats.tracks import RecordingError
 from topspin.render.film import check_tools
 from topspin.render.options import film
 
@@ -51,13 +54,23 @@ def main(argv: Sequence[str], stop: Event) -> int:
         check_tools()
     folder = policy_folder(config.policy)
     policy = load_policy(folder)
-    task = match_task(policy.contract, config).model_copy(update={"rounds": 1, "collision": "tailored"})
+    task = task_of(policy.contract, config)
 
     recorded = read(config, task.flight_model, on_tick)
-    block = recorded.rallies.block()
+    try:
+        block = recorded.rallies.block()
+    except RecordingError:
+        if config.json_line:
+            print_found(without_rallies(recorded, config), as_json=True)
+        raise
+    opponents = recorded.opponents(task.observation.is_tracked and task.observation.expected_spin == "learnt")
     log.info("playing rallies=%d of=%d mode=%s", len(block.seeds), len(recorded.tracks), config.mode)
-    played = play_match(policy, block, task, config.envs, on_tick)
-    found = measured(recorded, played, config) | {"policy": str(folder)}
+    played = play_match(policy, block, task, config.envs, on_tick, opponents)
+    found = measured(recorded, played, config) | {
+        "expected_spin": task.observation.expected_spin,
+        "opponents": len(np.unique(opponents)),
+        "policy": str(folder),
+    }
 
     shown = evenly(len(block.seeds), config.shown) if config.out and config.shown else evenly(0, 0)
     filmed = evenly(len(block.seeds), config.film_rallies) if video is not None else evenly(0, 0)
@@ -84,18 +97,39 @@ def video_of(config: Real2SimConfig) -> Path | None:
     return Path(config.video) if config.video else Path(config.out) / FILM_NAME
 
 
+def task_of(contract: Contract, config: Real2SimConfig) -> TaskConfig:
+    """Return the task in which recordings are played.
+
+    Every ball meets a robot that starts near its home (``carry_over`` 0): a recording says nothing of the stroke
+    before, and so its rally does not depend on the others.
+    """
+    task = match_task(contract, config, config.expected_spin)
+    return task.model_copy(update={"rounds": 1, "collision": "tailored", "carry_over": 0.0})
+
+
+def _left_out(recorded: Recorded, config: Real2SimConfig) -> dict[str, Any]:
+    valid = recorded.rallies.valid
+    return {
+        "data": config.data,
+        "recordings": len(valid),
+        "dropped": dict(recorded.dropped),
+        "skipped": dict(recorded.skipped),
+        "valid_share": round(float(valid.mean()), 4),
+        "invalid": recorded.rallies.invalid,
+    }
+
+
+def without_rallies(recorded: Recorded, config: Real2SimConfig) -> dict[str, Any]:
+    """Return what there is to say if no recording is a valid rally, ready for JSON."""
+    return _left_out(recorded, config) | recorded.fit_summary() | {"rallies": 0, "mode": config.mode}
+
+
 def measured(recorded: Recorded, played: MatchResult, config: Real2SimConfig) -> dict[str, Any]:
     """Return the match's conditions and measures, ready for JSON."""
-    valid = recorded.rallies.valid
     by = breakdown(played)
     return (
-        {
-            "data": config.data,
-            "recordings": len(valid),
-            "dropped": dict(recorded.dropped),
-            "valid_share": round(float(valid.mean()), 4),
-        }
-        | recorded.fits()
+        _left_out(recorded, config)
+        | recorded.fit_summary()
         | measures(played)
         | {
             "by_speed": by["speed"],

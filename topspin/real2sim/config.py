@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.evaluation.match import DEFAULT_ENVS, Environments
+from common.evaluation.match import DEFAULT_ENVS, Environments, MatchSpin
 from common.service.settings import LogLevel
 from common.task.config import Perception, PlayConditions
 from topspin.render.options import FilmConfig
@@ -19,8 +19,8 @@ class Real2SimConfig(FilmConfig, PlayConditions):
     """
 
     often: ClassVar = (
-        *("data", "policy", "mode", "perception", "randomization", "rallies"),
-        *("turn", "out", "seed", "json"),
+        *("data", "policy", "mode", "perception", "randomization"),
+        *("expected_spin", "turn", "out", "seed", "json"),
     )
 
     data: str = Field("", description="recordings: a .json, .hdf5, .csv file, or a folder of them")
@@ -35,12 +35,16 @@ class Real2SimConfig(FilmConfig, PlayConditions):
         description="how the robot observes the ball: full: estimate of a filter from a camera's detections; "
         "cheap: its true state with delay and noise",
     )
+    expected_spin: MatchSpin = "contract"
     rallies: int = Field(
         0, ge=0, le=1_000_000, description="recordings to play, spread evenly over all; 0: every one"
     )
     turn: bool = Field(
         False,
         description="rotate states that fly away from the robot by 180 degrees, instead of dropping them",
+    )
+    strict: bool = Field(
+        False, description="stop at the first file of a folder that can't be used, instead of skipping it"
     )
     seed: int = Field(
         0, ge=0, lt=2**63, description="seed of the rest: the same balls with other targets, tables and noise"

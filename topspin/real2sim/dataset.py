@@ -12,10 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from common.physics.flight import Flight
+from common.task.launch import SPIN
 from topspin.real2sim import replay
 from topspin.real2sim.config import Real2SimConfig
 from topspin.real2sim.formats.recordings import load, load_folder
-from topspin.real2sim.formats.tracks import RecordingError, Recordings, States, Track
+from topspin.real2sim.formats.tracks import FEWEST_SAMPLES, RecordingError, Recordings, States, Track
 from topspin.real2sim.kinematic import driven
 from topspin.real2sim.replay import RecordedRallies
 
@@ -28,6 +29,8 @@ Integers = npt.NDArray[np.int64]
 log = logging.getLogger(__name__)
 
 PROGRESS_EVERY_S: Final = 5.0  # [s] between two lines of progress
+
+FIRST_PART: Final = 0.05  # [s] of a track, which shows where it flies
 
 SAME_NAME: Final = "recording with the name of another"
 TRACK_AWAY: Final = "track that flies away from the robot"
@@ -42,25 +45,53 @@ class Recorded:
     Attributes:
         rallies: One row each, states first.
         tracks: The track of each row; None for a state.
-        fit_rms: (n,) distance [m] between samples and fit (root of the mean square); nan for a state.
+        fits: The fit of each row; None for a state.
         dropped: How many samples and recordings were left out, by reason.
+        skipped: Files that could not be used, and why, by name.
     """
 
     rallies: RecordedRallies
     tracks: tuple[Track | None, ...]
-    fit_rms: Array
+    fits: tuple["Fit | None", ...]
     dropped: Mapping[str, int]
+    skipped: Mapping[str, str]
 
-    def fits(self) -> dict[str, Any]:
+    @property
+    def fit_rms(self) -> Array:
+        """Return the distance [m] between samples and fit (root of the mean square) (n,); nan for a state."""
+        return np.array([float("nan") if one is None else one.rms for one in self.fits])
+
+    def fit_summary(self) -> dict[str, Any]:
         """Return the errors of the fits, ready for JSON; {} without fits."""
-        rms = self.fit_rms[np.isfinite(self.fit_rms)]
-        if not len(rms):
+        fits = [one for one in self.fits if one is not None]
+        if not fits:
             return {}
+        rms = [one.rms for one in fits]
         return {
-            "tracks_fitted": len(rms),
+            "tracks_fitted": len(fits),
+            "samples": sum(one.samples for one in fits),
+            "used_samples": sum(one.used_samples for one in fits),
             "fit_rms_median": round(float(np.median(rms)), 5),
             "fit_rms_p90": round(float(np.quantile(rms, 0.9)), 5),
+            "noise_median": round(float(np.median([one.noise[0] for one in fits])), 5),
+            "spin_sigma_median": [
+                round(float(sigma), 1) for sigma in np.median([one.sigmas[SPIN] for one in fits], axis=0)
+            ],
         }
+
+    def opponents(self, are_remembered: bool) -> Integers:
+        """Return the number of each valid rally's opponent (n,): one for each player, and for each unknown one.
+
+        Args:
+            are_remembered: Whether the robot learns from ball to ball. Otherwise each ball has its own opponent, which
+                makes no difference.
+        """
+        players = [self.rallies.players[k] for k in np.flatnonzero(self.rallies.valid)]
+        if not are_remembered:
+            return np.arange(len(players), dtype=np.int64)
+        names = [("player", player) if player else ("ball", k) for k, player in enumerate(players)]
+        numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+        return np.array([numbers[name] for name in names], np.int64)
 
 
 def read(config: Real2SimConfig, flight: Flight, on_tick: Callable[[], None] = lambda: None) -> Recorded:
@@ -75,7 +106,13 @@ def read(config: Real2SimConfig, flight: Flight, on_tick: Callable[[], None] = l
         RecordingError: A file can't be used, or nothing is left.
     """
     path = Path(config.data)
-    files = load_folder(path, turn=config.turn) if path.is_dir() else (load(path, turn=config.turn),)
+    skipped: dict[str, str] = {}
+    if path.is_dir():
+        files = load_folder(path, turn=config.turn, skipped=None if config.strict else skipped)
+    else:
+        files = (load(path, turn=config.turn),)
+    for name, error in skipped.items():
+        log.warning("skipped file=%s error=%s", name, error)
     dropped: Counter[str] = Counter()
     for found in files:
         dropped.update(found.dropped)
@@ -87,11 +124,11 @@ def read(config: Real2SimConfig, flight: Flight, on_tick: Callable[[], None] = l
             )
         dropped.update({NO_TRACK: len(states)} if len(states) else {})
         states = States.none()
-    coming = [track for track in tracks if track.positions[-1, 0] < track.positions[0, 0]]
+    coming = [track for track in tracks if _comes(track)]
     dropped.update({TRACK_AWAY: len(tracks) - len(coming)} if len(coming) < len(tracks) else {})
     chosen = evenly(len(states) + len(coming), config.rallies)
     n = len(states)
-    return _as_rallies(
+    recorded = _as_rallies(
         _rows(states, chosen[chosen < n]),
         [coming[k - n] for k in chosen[chosen >= n]],
         config,
@@ -99,6 +136,14 @@ def read(config: Real2SimConfig, flight: Flight, on_tick: Callable[[], None] = l
         dropped,
         on_tick,
     )
+    return replace(recorded, skipped=skipped)
+
+
+def _comes(track: Track) -> bool:
+    """Return whether a track begins towards the robot; it may go on after the robot's stroke."""
+    row = max(FEWEST_SAMPLES - 1, int(np.searchsorted(track.times, FIRST_PART)))
+    row = min(row, len(track.times) - 1)
+    return bool(track.positions[row, 0] < track.positions[0, 0])
 
 
 def evenly(count: int, most: int) -> Integers:
@@ -114,6 +159,7 @@ def _rows(states: States, rows: Integers) -> States:
         states.velocities[rows],
         states.spins[rows],
         tuple(states.labels[k] for k in rows),
+        tuple(states.players[k] for k in rows),
     )
 
 
@@ -146,6 +192,7 @@ def _with_unique_names(files: Sequence[Recordings], dropped: Counter[str]) -> tu
         np.concatenate([part.velocities for part in parts]),
         np.concatenate([part.spins for part in parts]),
         tuple(label for part in parts for label in part.labels),
+        tuple(player for part in parts for player in part.players),
     )
     return states, tracks
 
@@ -161,23 +208,27 @@ def _as_rallies(
     model = int(flight)
     parts: list[RecordedRallies] = []
     kept: list[Track | None] = [None] * len(states)
-    rms = [float("nan")] * len(states)
+    kept_fits: list[Fit | None] = [None] * len(states)
     if len(states):
-        # randomization off: the air of the recording is unknown, and nominal is the best guess
-        parts.append(replay.of_states(states, seed=config.seed, randomization="off", flight=model))
+        # air "off": the air of the recording is unknown, and nominal is the best guess
+        parts.append(
+            replay.of_states(
+                states, seed=config.seed, air="off", randomization=config.randomization, flight=model
+            )
+        )
     fitted, fits = _fitted(tracks, model, dropped, on_tick)
     if fits:
-        labels = [track.label for track in fitted]
-        found = replay.of_fits(fits, labels, seed=config.seed)
+        labels, players = [track.label for track in fitted], [track.player for track in fitted]
+        found = replay.of_fits(fits, labels, players, seed=config.seed, randomization=config.randomization)
         if config.mode == "kinematic":
-            found = driven(found, fitted, fits)
+            found = driven(found, fitted, fits, config.randomization)
         parts.append(found)
         kept += fitted
-        rms += [one.rms for one in fits]
+        kept_fits += fits
     if not parts:
         reasons = "; ".join(f"{reason}: {count}" for reason, count in dropped.items())
         raise RecordingError(f"{config.data}: no recording is left to play ({reasons or 'there is none'})")
-    return Recorded(_joined(parts), tuple(kept), np.array(rms), dict(dropped))
+    return Recorded(_joined(parts), tuple(kept), tuple(kept_fits), dict(dropped), {})
 
 
 def _joined(parts: Sequence[RecordedRallies]) -> RecordedRallies:
@@ -189,7 +240,8 @@ def _joined(parts: Sequence[RecordedRallies]) -> RecordedRallies:
         tuple(label for part in parts for label in part.labels),
         np.concatenate([part.launches for part in parts]),
         np.concatenate([part.seeds for part in parts]),
-        np.concatenate([part.valid for part in parts]),
+        np.concatenate([part.touched for part in parts]),
+        players=tuple(player for part in parts for player in part.players),
     )
 
 

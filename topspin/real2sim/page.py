@@ -198,9 +198,12 @@ def _interval(bounds: tuple[float, float] | None, scale: float, digits: int, uni
 
 
 def _left_out(found: Mapping[str, Any]) -> tuple[Table, ...]:
-    if not found["dropped"]:
+    rows = tuple(
+        (reason, str(count)) for key in ("dropped", "invalid") for reason, count in found[key].items()
+    )
+    rows += tuple((f"file {name}", "1") for name in found["skipped"])
+    if not rows:
         return ()
-    rows = tuple((reason, str(count)) for reason, count in found["dropped"].items())
     return (Table("What was left out", ("reason", "number"), rows),)
 
 

@@ -3,25 +3,37 @@
 Least squares through the project's own flight and bounce, with a robust loss, each sample weighted by its noise.
 Priors determine what the samples don't, and the covariance shows it:
 
-* The spin along the velocity makes no lift. It shows only a little as the velocity turns; its prior
-  (zero, ``spin_sigma``) does the rest.
-* Only the product of lift factor and spin rate acts on a flight, and above S = 0.25 the simple model's lift is
-  saturated: more spin changes nothing. The result is the smallest spin that explains the lift, and towards more spin
-  its sigma is the prior's. A bounce gives information about the spin again, if the ball rolls as it leaves.
+* The spin along the velocity makes no lift. It shows only a little as the velocity turns; its prior does the rest.
+* Only the product of lift factor and spin rate acts on a flight, and fast spin changes the lift little. So many rates
+  explain a flight equally well: ``spin_posterior`` finds all of them, and the result is the launch in their middle. A
+  bounce gives information about the spin again, if the ball rolls as it leaves.
 * Priors keep drag and lift factor near 1, and restitution and friction of the table near the nominal ones, where
   the fit goes through a bounce.
 """
 
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Final
 
 import numpy as np
 
 from common.physics.constants import AIR_FACTOR, BALL_RADIUS, GRAVITY
 from common.physics.flight import SIMPLE_DRAG, SIMPLE_LIFT_MAX, SIMPLE_LIFT_SLOPE
-from common.task.launch import DRAG_FACTOR, LAUNCH_SIZE, LIFT_FACTOR, POSITION, SPIN, VELOCITY
-from topspin.real2sim.fit.bounces import touches
-from topspin.real2sim.fit.fit_problem import FRICTION, RESTITUTION0, UNKNOWNS, Air, FitOptions, Problem
+from common.task.launch import DRAG_FACTOR, LIFT_FACTOR, POSITION, SPIN, VELOCITY
+from topspin.real2sim.fit.bounces import Bounce, Touches, touches
+from topspin.real2sim.fit.fit_problem import (
+    FLOWN,
+    FRICTION,
+    NO_TABLE,
+    RESTITUTION0,
+    UNKNOWNS,
+    Air,
+    FitOptions,
+    Problem,
+)
+from topspin.real2sim.fit.predict import predict
+from topspin.real2sim.fit.spin_posterior import spin_posterior
 from topspin.real2sim.formats.tracks import FEWEST_SAMPLES, Array, RecordingError, Track
 
 SPIN_STARTS: Final = (
@@ -29,6 +41,8 @@ SPIN_STARTS: Final = (
     2.5,
     5.0,
 )  # times the spin before the bounce: starts of the search through the bounce
+THINNED: Final = 0.005  # s; samples of a fast camera are averaged over so long: the path bends by 10 um
+PRIOR_SAMPLES: Final = 10.0  # as so many samples the noise in the options counts
 _MAD: Final = 1.4826  # median of |x| to sigma, normal distribution
 
 
@@ -41,11 +55,14 @@ class Fit:
         launch: (11,) position [m], velocity [m/s], spin [rad/s], drag and lift factor at the track's first sample.
         table: (2,) the table's restitution e_0 and friction mu: the priors' means if the fit has no bounce.
         covariance: (13, 13) of launch and table; zero for values that were not free.
+        spin_interval: (2, 3) [rad/s] 95 % interval of each component of the spin.
         rms: Of the 3-D distance between samples and fit [m].
         used_samples: Number of samples in the fit.
-        bounced: The fit goes through a bounce.
-        noise_scale: Residuals' robust sigma over the noise in ``FitOptions`` [-]; well above 1: the model doesn't
-            explain the track. The covariance is scaled by it.
+        samples: Number of samples in the track.
+        bounced: The fit goes through a bounce, or through both bounces of a serve.
+        is_serve: The ball bounced on the server's own court first.
+        noise: Sigma of a sample's position [m] and of its time stamp [s], as the residuals show them; well above those
+            in ``FitOptions``: the model doesn't explain the track. The covariance contains them.
         options: What was fitted.
     """
 
@@ -53,10 +70,13 @@ class Fit:
     launch: Array
     table: Array
     covariance: Array
+    spin_interval: Array
     rms: float
     used_samples: int
+    samples: int
     bounced: bool
-    noise_scale: float
+    is_serve: bool
+    noise: tuple[float, float]
     options: FitOptions
 
     @property
@@ -116,20 +136,53 @@ def _first_guess(track: Track, options: FitOptions) -> Array:
     return launch
 
 
-def _part(track: Track, end: int) -> Track:
-    return Track(track.id, track.times[:end], track.positions[:end], track.label)
+def _part(track: Track, end: int, bounces: Sequence[Bounce] = ()) -> Track:
+    """Return the first samples of a track. Those of a fast camera are averaged over ``THINNED``, between bounces."""
+    times, positions = track.times[:end], track.positions[:end]
+    many = int(THINNED / float(np.median(np.diff(times)))) if end > 1 else 1
+    if many < 2:
+        return replace(track, times=times, positions=positions)
+    cuts = [0, *(bounce.first_after for bounce in bounces if bounce.first_after < end), end]
+    parts = [
+        rows
+        for first, last in pairwise(cuts)
+        for rows in np.array_split(np.arange(first, last), max(1, (last - first) // many))
+        if len(rows)
+    ]
+    return replace(
+        track,
+        times=np.array([times[rows].mean() for rows in parts]),
+        positions=np.array([positions[rows].mean(axis=0) for rows in parts]),
+    )
 
 
-def fit(track: Track, options: FitOptions | None = None) -> Fit:
-    """Return the launch that explains a track best.
+def _noise(problem: Problem, unknowns: Array) -> tuple[float, float]:
+    """Return the noise that the residuals show: sigma of a position [m] and of a time stamp [s].
 
-    Samples after a stroke or a second bounce are left out.
-
-    Raises:
-        RecordingError: Too few samples before the first bounce or stroke.
+    The noise in the options counts as ``PRIOR_SAMPLES`` samples. Across the flight, time stamps have no effect.
     """
-    options = options or FitOptions()
-    found = touches(track)
+    problem.residuals(unknowns)
+    speed = np.linalg.norm(problem.velocities, axis=1)
+    along = problem.velocities / np.maximum(speed, 1e-9)[:, None]
+    off = problem.track.positions - problem.predicted
+    lengthwise = np.sum(off * along, axis=1)
+    across = np.linalg.norm(off - lengthwise[:, None] * along, axis=1)
+    n = len(across)
+    free = n / max(n - len(unknowns) / 3.0, 0.5 * n)  # what the unknowns took
+
+    def pooled(shown: float, assumed: float) -> float:
+        return (n * free * shown + PRIOR_SAMPLES * assumed) / (n + PRIOR_SAMPLES)
+
+    # the median of the distance in two directions is 1.1774 sigma
+    position = pooled((float(np.median(across)) / 1.1774) ** 2, problem.options.position_sigma**2)
+    typical = float(np.median(speed))
+    assumed = position + (problem.options.timing_sigma * typical) ** 2
+    total = pooled((_MAD * float(np.median(np.abs(lengthwise)))) ** 2, assumed)
+    return float(np.sqrt(position)), float(np.sqrt(max(total - position, 0.0)) / max(typical, 1e-9))
+
+
+def _solved(track: Track, found: Touches, options: FitOptions) -> tuple[Problem, Any]:
+    """Return the least squares of a track, through its bounces if the options say so, and their solution."""
     before = found.bounces[0].first_after if found.bounces else found.end
     if before < FEWEST_SAMPLES:
         raise RecordingError(
@@ -141,31 +194,56 @@ def fit(track: Track, options: FitOptions | None = None) -> Fit:
     problem = Problem(flight, options, False, first)
     best = problem.solve(first)
     if found.bounces and options.through_bounce:
-        end = found.bounces[1].first_after if len(found.bounces) > 1 else found.end
         values = problem.values(best.x)
-        problem = Problem(_part(track, end), options, True, first)
+        problem = Problem(_part(track, found.flight_end, found.bounces), options, True, first)
         starts = [values.copy() for _ in (SPIN_STARTS if options.air is Air.ALL else SPIN_STARTS[:1])]
         for start, factor in zip(starts, SPIN_STARTS, strict=False):
             start[SPIN] *= factor
         best = min((problem.solve(start) for start in starts), key=lambda result: float(result.cost))
-    samples = problem.residuals(best.x)[: problem.predicted.size]
-    scale = max(1.0, _MAD * float(np.median(np.abs(samples))))
-    if scale > 1.0:
-        # with too small a noise, the priors would have too little weight
-        wider = Problem(problem.track, options, problem.bounces, first, scale)
-        best, problem = wider.solve(problem.values(best.x)), wider
-    covariance = problem.covariance(best.x)
-    problem.residuals(best.x)
-    distances = np.linalg.norm(problem.predicted - problem.track.positions, axis=1)
-    values = problem.values(best.x)
+    # with too small a noise, the priors would have too little weight
+    noise = _noise(problem, best.x)
+    weighted = Problem(problem.track, options, problem.bounces, first, noise)
+    return weighted, weighted.solve(problem.values(best.x))
+
+
+def fit(track: Track, options: FitOptions | None = None) -> Fit:
+    """Return the launch that explains a track best.
+
+    Samples after a stroke or after a second bounce on the robot's court are left out.
+
+    Raises:
+        RecordingError: Too few samples before the first bounce or stroke.
+    """
+    options = options or FitOptions()
+    found = touches(track)
+    problem, best = _solved(track, found, options)
+    if options.air is not Air.ALL:
+        values, covariance = problem.values(best.x), problem.covariance(best.x)
+        interval = np.stack([values[SPIN], values[SPIN]])
+    else:
+        moments = np.array([bounce.time for bounce in found.bounces] if problem.bounces else [])
+        shown = spin_posterior(problem, best.x, moments)
+        values, covariance, interval = shown.values, shown.covariance, shown.spin_interval
+    end = (
+        found.flight_end
+        if problem.bounces
+        else (found.bounces[0].first_after if found.bounces else found.end)
+    )
+    predicted = np.empty((end, 3))
+    table = values[RESTITUTION0:] if problem.bounces else NO_TABLE
+    predict(values[:FLOWN], table, options.flight, track.times[:end], predicted, np.empty((end, 3)))
+    distances = np.linalg.norm(predicted - track.positions[:end], axis=1)
     return Fit(
-        track.id,
-        values[:LAUNCH_SIZE],
-        values[RESTITUTION0:],
-        covariance,
-        float(np.sqrt(np.mean(distances**2))),
-        len(distances),
-        problem.bounces,
-        scale,
-        options,
+        id=track.id,
+        launch=values[:FLOWN],
+        table=values[RESTITUTION0:],
+        covariance=covariance,
+        spin_interval=interval,
+        rms=float(np.sqrt(np.mean(distances**2))),
+        used_samples=end,
+        samples=len(track.times),
+        bounced=problem.bounces,
+        is_serve=problem.bounces and found.is_serve,
+        noise=problem.noise,
+        options=options,
     )

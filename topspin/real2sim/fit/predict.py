@@ -39,7 +39,7 @@ def _time_to_table(pos: Vec, vel: Vec, spin: Vec, h: float, drag: float, lift: f
 
 
 @kernel
-def _advance(
+def advance(
     pos: Vec, vel: Vec, spin: Vec, h: float, drag: float, lift: float, model: int, table: Array
 ) -> tuple[Vec, Vec, Vec]:
     """Return position, velocity and spin ``h`` seconds later, with every bounce in between.
@@ -48,7 +48,7 @@ def _advance(
         pos: Position [m].
         vel: Velocity [m/s].
         spin: Spin [rad/s].
-        h: At most ``GRID_STEP`` [s].
+        h: Time [s], so short that the ball bounces a few times at most.
         drag: Drag factor [-].
         lift: Lift factor [-].
         model: ``flight.SIMPLE`` or ``flight.FULL``.
@@ -91,7 +91,7 @@ def predict(
         steps = math.ceil((times[k] - now) / GRID_STEP - 1e-9)
         for _ in range(steps):
             h = (times[k] - now) / steps
-            pos, vel, spin = _advance(pos, vel, spin, h, launch[9], launch[10], model, table)
+            pos, vel, spin = advance(pos, vel, spin, h, launch[9], launch[10], model, table)
         now = times[k]
         for j in range(3):
             positions[k, j], velocities[k, j] = pos[j], vel[j]
@@ -117,6 +117,40 @@ def touch_down(launch: Array, model: int, longest: float) -> tuple[float, Vec, V
             return step * GRID_STEP + t, there, falling
         pos, vel = p, v
     return np.nan, pos, vel
+
+
+@kernel
+def bounce_moments(launch: Array, table: Array, model: int, longest: float, moments: Array) -> int:
+    """Write when a launched ball bounces on the table, and return how often it does.
+
+    Args:
+        launch: As in ``predict``.
+        table: Restitution e_0 and friction of the table [-] (2,).
+        model: ``flight.SIMPLE`` or ``flight.FULL``.
+        longest: Time [s] after which the search ends.
+        moments: (n,) [s], written; the search ends with the n-th bounce.
+    """
+    pos = (launch[0], launch[1], launch[2])
+    vel = (launch[3], launch[4], launch[5])
+    spin = (launch[6], launch[7], launch[8])
+    drag, lift = launch[9], launch[10]
+    count, now = 0, 0.0
+    while now < longest and count < moments.shape[0]:
+        p, v = flight_step(pos, vel, spin, GRID_STEP, Air(drag, lift, model))
+        if not (pos[2] >= BALL_RADIUS > p[2] and v[2] < 0.0):
+            now += GRID_STEP
+            pos, vel = p, v
+            continue
+        t = _time_to_table(pos, vel, spin, GRID_STEP, drag, lift, model)
+        at, vel = flight_step(pos, vel, spin, t, Air(drag, lift, model))
+        if abs(at[0]) > TABLE_HALF_LENGTH or abs(at[1]) > TABLE_HALF_WIDTH or vel[2] >= 0.0:
+            break
+        now += t
+        moments[count] = now
+        count += 1
+        vel, spin = table_bounce(vel, spin, (0.0, 0.0, 1.0), table[0], table[1])
+        pos = (at[0], at[1], BALL_RADIUS)
+    return count
 
 
 @kernel

@@ -9,7 +9,8 @@ recorded bounce on it:
 * The gun's x = 0 is the end of the table: the balls bounce at 1.9 to 2.6 of its 2.74 m.
 * y = 0 is the table's middle: the balls stay within 0.11 m of it.
 
-The published velocities are quotients of neighbouring samples and are not read.
+The published velocities are quotients of neighbouring samples and are not read. A sidecar may give ``label`` and
+``player``; the frame is the format's.
 """
 
 from collections import Counter
@@ -19,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from common.physics.constants import BALL_RADIUS, TABLE_HALF_LENGTH
-from topspin.real2sim.formats.frames import Frame, rotation_of
+from topspin.real2sim.formats.frames import Frame, read_frame, rotation_of
 from topspin.real2sim.formats.tracks import RecordingError, Recordings, States, Track, checked_tracks
 
 BOUNCE_HEIGHT: Final = 0.759  # m; of the ball's centre, in the files' frame
@@ -36,7 +37,8 @@ def read_hdf5(path: Path) -> Recordings:
         import h5py  # noqa: PLC0415 - an extra that other formats do not need
     except ImportError:
         raise RecordingError(f"{path}: HDF5 needs h5py: pip install -e '.[real2sim]'") from None
-    label = next((known for known in LABELS if known in path.stem), "")
+    given = read_frame(path)
+    label = given.label or next((known for known in LABELS if known in path.stem), "")
     dropped: Counter[str] = Counter()
     tracks: list[Track] = []
     try:
@@ -53,7 +55,7 @@ def read_hdf5(path: Path) -> Recordings:
                         "allowed: (n,) and (n, 3)"
                     )
                 mapped = FRAME.positions(positions)
-                tracks += checked_tracks(f"{path.stem}/{name}", times, mapped, label, dropped)
+                tracks += checked_tracks(f"{path.stem}/{name}", times, mapped, label, dropped, given.player)
     except OSError as error:
         raise RecordingError(f"{path}: not readable as HDF5: {error}") from None
     return Recordings(str(path), tuple(tracks), States.none(), dict(dropped))

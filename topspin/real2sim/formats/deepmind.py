@@ -1,6 +1,7 @@
 """States of balls just after a stroke, as google-deepmind/competitive_robot_table_tennis publishes them (JSON).
 
-A list of objects ``{id, pos_x, pos_y, pos_z, vel_x ... w_vel_z}`` in m, m/s and rad/s. Its frame: origin at the
+A list of objects ``{id, pos_x, pos_y, pos_z, vel_x ... w_vel_z}`` in m, m/s and rad/s, with an optional ``player``.
+A sidecar may give ``label``, ``player`` and ``velocity_delay_s``; the frame is the format's. Its frame: origin at the
 centre of the table's top, x across the table (right positive), y along it, z up. The opponent stands at y > 0 and
 plays towards -y, so the world's x (robot to opponent) is its y, and the world's y (to the robot's left) its -x.
 """
@@ -12,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from topspin.real2sim.formats.frames import Frame, rotation_of
+from topspin.real2sim.formats.frames import Frame, read_frame, rotation_of
 from topspin.real2sim.formats.tracks import RecordingError, Recordings, States, checked_states
 
 FRAME: Final = Frame(rotation_of(("y", "-x", "z")), np.zeros(3))
@@ -35,7 +36,10 @@ def read_json(path: Path, turn: bool) -> Recordings:
         [FRAME.positions(rows[:, :3]), FRAME.velocities(rows[:, 3:6]), FRAME.spins(rows[:, 6:9])]
     )
     dropped: Counter[str] = Counter()
-    states: States = checked_states(ids, world, [path.stem] * len(ids), dropped, turn)
+    given = read_frame(path)
+    players = [str(entry.get("player", given.player)) for entry in entries]
+    labels = [given.label or path.stem] * len(ids)
+    states: States = checked_states(ids, world, labels, dropped, turn, players, given.velocity_delay)
     return Recordings(str(path), (), states, dict(dropped))
 
 

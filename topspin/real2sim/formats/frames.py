@@ -9,6 +9,11 @@
     axes = ["y", "-x", "z"]    # the file's axes along which the world's x, y and z lie
     origin = [0.0, 0.0, 760.0] # the centre of the table's top, in the file's frame and unit of length
     label = "topspin"          # of every recording in the file
+    player = "Ma"              # who played every ball of the file
+    columns = ["t", "x", "y", "z"] # names of the columns of a text file, in place of a first line with names
+    velocity_delay_s = 0.015   # states: the velocities belong to moments so much later than the positions
+
+A file without its own TOML file has that of its folder, ``folder.toml``, if there is one.
 
 ``axes`` is a rotation and never a mirror image: a mirrored spin would have the wrong sign.
 """
@@ -34,8 +39,14 @@ SPIN_UNITS: Final = {
     "rpm": 2.0 * math.pi / 60.0,
     "deg/s": math.pi / 180.0,
 }
+LONGEST_DELAY: Final = 0.1  # s
 KINDS: Final = ("", "track", "states")
 FRAME_NUMBER: Final = "frame"
+FOLDER_SIDECAR: Final = "folder.toml"  # applies to all files of its folder that have no sidecar of their own
+KEYS: Final = (
+    *("kind", "length_unit", "time_unit", "rate_hz", "spin_unit", "axes", "origin", "label"),
+    *("player", "columns", "velocity_delay_s"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +62,9 @@ class Frame:
         step: Time between samples [s], for a file without times; 0: unknown.
         kind: ``track``, ``states``, or empty: the columns decide.
         label: The label of every recording.
+        player: Who played every ball.
+        columns: Names of a text file's columns; empty: its first line has them.
+        velocity_delay: Time [s] by which the moments of a state's velocity are later than those of its position.
     """
 
     rotation: Array
@@ -61,18 +75,26 @@ class Frame:
     step: float = 0.0
     kind: str = ""
     label: str = ""
+    player: str = ""
+    columns: tuple[str, ...] = ()
+    velocity_delay: float = 0.0
 
     def positions(self, file_positions: Array) -> Array:
-        """Return positions (n, 3) [m] in the world frame."""
-        return self.length * (file_positions - self.origin) @ self.rotation.T
+        """Return positions (n, 3) [m] in the world frame; nan for rows that are not finite, as in all of these."""
+        return self.length * (_finite(file_positions) - self.origin) @ self.rotation.T
 
     def velocities(self, file_velocities: Array) -> Array:
         """Return velocities (n, 3) [m/s] in the world frame; the file's are in its lengths per second."""
-        return self.length * file_velocities @ self.rotation.T
+        return self.length * _finite(file_velocities) @ self.rotation.T
 
     def spins(self, file_spins: Array) -> Array:
         """Return spins (n, 3) [rad/s] in the world frame."""
-        return self.spin * file_spins @ self.rotation.T
+        return self.spin * _finite(file_spins) @ self.rotation.T
+
+
+def _finite(rows: Array) -> Array:
+    """Return rows with nan in place of infinity, whose products with 0 make NumPy warn."""
+    return np.where(np.isfinite(rows), rows, np.nan)
 
 
 def world_frame() -> Frame:
@@ -96,12 +118,13 @@ def rotation_of(axes: tuple[str, ...]) -> Array:
 
 
 def sidecar_of(path: Path) -> Path:
-    """Return the path of a file's sidecar."""
-    return path.with_suffix(".toml")
+    """Return the path of a file's sidecar: its own, or that of its folder if only that is there."""
+    own, shared = path.with_suffix(".toml"), path.parent / FOLDER_SIDECAR
+    return shared if shared.is_file() and not own.is_file() else own
 
 
 def read_frame(path: Path) -> Frame:
-    """Return the frame of the recording at ``path`` by the TOML file beside it; the world's if there is none."""
+    """Return the frame of the recording at ``path`` by its TOML file or its folder's; the world's without one."""
     sidecar = sidecar_of(path)
     if not sidecar.is_file():
         return world_frame()
@@ -113,19 +136,20 @@ def read_frame(path: Path) -> Frame:
 
 
 def _frame(table: dict[str, Any], sidecar: Path) -> Frame:
-    known = ("kind", "length_unit", "time_unit", "rate_hz", "spin_unit", "axes", "origin", "label")
     for key in table:
-        if key not in known:
-            raise RecordingError(f"{sidecar}: unknown key {key!r}; allowed: {', '.join(known)}")
+        if key not in KEYS:
+            raise RecordingError(f"{sidecar}: unknown key {key!r}; allowed: {', '.join(KEYS)}")
     rate = table.get("rate_hz")
     time_unit = _choice(table, "time_unit", (*TIME_UNITS, FRAME_NUMBER), "s", sidecar)
     if rate is not None and not (_is_number(rate) and rate > 0.0):
         raise RecordingError(f"{sidecar}: rate_hz: got {rate!r}; allowed: a number above 0")
     if time_unit == FRAME_NUMBER and rate is None:
         raise RecordingError(f"{sidecar}: time_unit 'frame' needs rate_hz, which is missing")
-    label = table.get("label", "")
-    if not isinstance(label, str):
-        raise RecordingError(f"{sidecar}: label: got {label!r}; allowed: a string")
+    delay = table.get("velocity_delay_s", 0.0)
+    if not (_is_number(delay) and abs(delay) <= LONGEST_DELAY):
+        raise RecordingError(
+            f"{sidecar}: velocity_delay_s: got {delay!r}; allowed: -{LONGEST_DELAY:g} to {LONGEST_DELAY:g}"
+        )
     return Frame(
         rotation=_rotation(table.get("axes", ["x", "y", "z"]), sidecar),
         origin=_origin(table.get("origin", [0.0, 0.0, 0.0]), sidecar),
@@ -134,8 +158,26 @@ def _frame(table: dict[str, Any], sidecar: Path) -> Frame:
         spin=SPIN_UNITS[_choice(table, "spin_unit", tuple(SPIN_UNITS), "rad/s", sidecar)],
         step=1.0 / rate if rate is not None else 0.0,
         kind=_choice(table, "kind", KINDS, "", sidecar),
-        label=label,
+        label=_text(table, "label", sidecar),
+        player=_text(table, "player", sidecar),
+        columns=_columns(table.get("columns", []), sidecar),
+        velocity_delay=float(delay),
     )
+
+
+def _text(table: dict[str, Any], key: str, sidecar: Path) -> str:
+    value = table.get(key, "")
+    if not isinstance(value, str):
+        raise RecordingError(f"{sidecar}: {key}: got {value!r}; allowed: a string")
+    return value
+
+
+def _columns(columns: object, sidecar: Path) -> tuple[str, ...]:
+    if not (isinstance(columns, list) and all(isinstance(name, str) for name in columns)):
+        raise RecordingError(
+            f'{sidecar}: columns: got {columns!r}; allowed: a list such as ["t", "x", "y", "z"]'
+        )
+    return tuple(columns)
 
 
 def _is_number(value: object) -> bool:

@@ -35,10 +35,20 @@ def load(path: Path, *, turn: bool = False) -> Recordings:
     raise RecordingError(f"{path}: got a {suffix or 'nameless'} file; allowed: {', '.join(SUFFIXES)}")
 
 
-def load_folder(folder: Path, pattern: str = "*", *, turn: bool = False) -> tuple[Recordings, ...]:
+def load_folder(
+    folder: Path, pattern: str = "*", *, turn: bool = False, skipped: dict[str, str] | None = None
+) -> tuple[Recordings, ...]:
     """Return the recordings of every file in a folder that matches ``pattern`` and has a known suffix, by name.
 
-    ``turn`` as for ``load``.
+    Args:
+        folder: The folder.
+        pattern: Which files.
+        turn: As for ``load``.
+        skipped: Files that can't be used are left out, and their names and errors are written here. None: such a file
+            raises its error.
+
+    Raises:
+        RecordingError: There is no folder or no file, or no file can be used.
     """
     if not folder.is_dir():
         raise RecordingError(f"{folder}: no such folder")
@@ -47,4 +57,15 @@ def load_folder(folder: Path, pattern: str = "*", *, turn: bool = False) -> tupl
         raise RecordingError(
             f"{folder}: no recordings; allowed: files {pattern} ending in {', '.join(SUFFIXES)}"
         )
-    return tuple(load(path, turn=turn) for path in paths)
+    found = list[Recordings]()
+    for path in paths:
+        try:
+            found.append(load(path, turn=turn))
+        except RecordingError as error:
+            if skipped is None:
+                raise
+            skipped[path.name] = str(error)
+    if not found and skipped:
+        first = next(iter(skipped.values()))
+        raise RecordingError(f"{folder}: none of {len(paths)} files can be used; the first: {first}")
+    return tuple(found)

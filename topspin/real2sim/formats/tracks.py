@@ -8,7 +8,7 @@ Positions here are in the world frame and SI. The rules are the same for every f
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from common.errors import ReportedError
+from common.physics.flight import FULL, Air, acceleration
+from common.physics.vec import vec_at
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -50,12 +52,14 @@ class Track:
         times: (n,) [s], rising, from 0.
         positions: (n, 3) [m] of the ball's centre, world frame.
         label: Kind of ball (``topspin`` ...); empty if unknown.
+        player: Who played the ball; empty if unknown.
     """
 
     id: str
     times: Array
     positions: Array
     label: str = ""
+    player: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +72,7 @@ class States:
         velocities: (n, 3) [m/s].
         spins: (n, 3) [rad/s].
         labels: Kind of each ball; empty if unknown.
+        players: Who played each ball; empty if unknown.
     """
 
     ids: tuple[str, ...]
@@ -75,6 +80,7 @@ class States:
     velocities: Array
     spins: Array
     labels: tuple[str, ...]
+    players: tuple[str, ...]
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -82,7 +88,7 @@ class States:
     @staticmethod
     def none() -> "States":
         """Return no states."""
-        return States((), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), ())
+        return States((), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3)), (), ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +116,8 @@ def require_some(recordings: Recordings) -> Recordings:
     return recordings
 
 
-def _inside(positions: Array) -> Mask:
+def inside_room(positions: Array) -> Mask:
+    """Return which positions (n, 3) [m] lie in the room (n,)."""
     low, high = np.array(ROOM).T
     inside: Mask = np.all((positions >= low) & (positions <= high), axis=1)
     return inside
@@ -141,7 +148,7 @@ def _refused(times: Array, positions: Array) -> str:
 
 
 def checked_tracks(
-    name: str, times: Array, positions: Array, label: str, dropped: Counter[str]
+    name: str, times: Array, positions: Array, label: str, dropped: Counter[str], player: str = ""
 ) -> list[Track]:
     """Return the tracks of a recording: usually one, none if it is bad, several if it has long gaps.
 
@@ -151,13 +158,14 @@ def checked_tracks(
         positions: (n, 3) [m], world.
         label: Kind of ball.
         dropped: Reasons are counted into this.
+        player: Who played the ball.
     """
     finite = np.isfinite(times) & np.isfinite(positions).all(axis=1)
     if len(times) and np.any(np.diff(times[finite]) < 0.0):
         dropped["recording whose time goes backwards"] += 1
         return []
     inside = finite.copy()
-    inside[finite] = _inside(positions[finite])
+    inside[finite] = inside_room(positions[finite])
     good = inside.copy()
     good[np.flatnonzero(inside)[1:]] = np.diff(times[inside]) > 0.0
     once = good.copy()
@@ -185,8 +193,17 @@ def checked_tracks(
         if reason := _refused(t, p):
             dropped[reason] += 1
             continue
-        tracks.append(Track(name if not len(cuts) else f"{name}-{part}", t - t[0], p, label))
+        tracks.append(Track(name if not len(cuts) else f"{name}-{part}", t - t[0], p, label, player))
     return tracks
+
+
+def _earlier(velocities: Array, spins: Array, delay: float) -> Array:
+    """Return the velocities (n, 3) [m/s] that balls had ``delay`` seconds before they had these."""
+    air = Air(1.0, 1.0, FULL)
+    found = np.empty_like(velocities)
+    for row, velocity, spin in zip(found, velocities, spins, strict=True):
+        row[:] = velocity - delay * np.array(acceleration(vec_at(velocity, 0), vec_at(spin, 0), air))
+    return found
 
 
 def checked_states(
@@ -195,6 +212,8 @@ def checked_states(
     labels: list[str],
     dropped: Counter[str],
     turn: bool = False,
+    players: Sequence[str] = (),
+    velocity_delay: float = 0.0,
 ) -> States:
     """Return the states that fly towards the robot.
 
@@ -204,7 +223,11 @@ def checked_states(
         labels: n labels.
         dropped: Reasons are counted into this.
         turn: Rotate states that fly towards the opponent by 180 degrees about z, instead of dropping them.
+        players: n names; none: unknown.
+        velocity_delay: Time [s] by which the moment of the velocities is later than that of the positions. The
+            velocity at the position is then v - velocity_delay a(v, w), with the nominal air of the full model.
     """
+    players = tuple(players) or ("",) * len(ids)
     rows = rows.copy()
     away = rows[:, 3] >= 0.0
     if turn:
@@ -215,7 +238,7 @@ def checked_states(
     keep = np.ones(len(rows), np.bool_)
     for reason, bad in (
         ("state that is not finite", ~np.isfinite(rows).all(axis=1)),
-        (f"state outside the room ({_ROOM_TEXT} m: check unit and frame)", ~_inside(rows[:, :3])),
+        (f"state outside the room ({_ROOM_TEXT} m: check unit and frame)", ~inside_room(rows[:, :3])),
         (
             f"state with a speed outside {SPEEDS[0]:g}..{SPEEDS[1]:g} m/s",
             ~((speeds >= SPEEDS[0]) & (speeds <= SPEEDS[1])),
@@ -229,10 +252,13 @@ def checked_states(
         keep &= ~bad
     kept = np.flatnonzero(keep)
     chosen = rows[kept]
+    if velocity_delay:
+        chosen[:, 3:6] = _earlier(chosen[:, 3:6], chosen[:, 6:9], velocity_delay)
     return States(
         tuple(ids[k] for k in kept),
         chosen[:, :3],
         chosen[:, 3:6],
         chosen[:, 6:9],
         tuple(labels[k] for k in kept),
+        tuple(players[int(k)] for k in kept),
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 from common.physics.constants import TABLE_FRICTION, TABLE_RESTITUTION0
-from common.physics.flight import SIMPLE
+from common.physics.flight import FULL
 from topspin.real2sim.fit.predict import predict
 from topspin.real2sim.formats.tracks import Track
 
@@ -15,7 +15,7 @@ def launch_of(pos=(1.3, 0.0, 0.33), vel=(-5.0, 0.1, 1.8), spin=(5.0, -40.0, 12.0
     return np.array([*pos, *vel, *spin, drag, lift])
 
 
-def seen(launch, duration=0.7, rate=180.0, noise=0.0, jitter=0.0, seed=0, flight=SIMPLE, table=TABLE):
+def seen(launch, duration=0.7, rate=180.0, noise=0.0, jitter=0.0, seed=0, flight=FULL, table=TABLE):
     """Return the track of a launch: position noise [m], and time stamps, except the first, off by ``jitter`` [s]."""
     rng = np.random.default_rng(seed)
     times = np.arange(0.0, duration, 1.0 / rate)

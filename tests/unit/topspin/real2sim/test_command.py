@@ -14,7 +14,8 @@ from common.policy.folder import save_policy
 from common.service.config import ConfigError, load
 from common.service.process import DONE
 from common.task.config import TaskConfig
-from common.task.launch import draw_rallies
+from common.task.launch import DRAG_FACTOR, KIND, draw_rallies
+from common.task.launch_presets import Kind
 from tests.unit.evaluation.test_match import make_policy
 from tests.unit.topspin.real2sim.flights import launch_of, seen
 from topspin import real2sim
@@ -76,13 +77,18 @@ def settings(**values):
     return Real2SimConfig(**values)
 
 
+def launches_of(*launches):
+    """Return launches (n, 12) of recorded balls."""
+    return np.array([np.append(launch, int(Kind.RECORDED)) for launch in launches])
+
+
 COMING = launch_of(spin=(3.0, -45.0, 5.0))
-INTO_NET = launch_of(vel=(-5.0, 0.0, -1.0))
+INTO_NET = launch_of(vel=(-5.0, 0.0, 0.5))
 
 
 def test_states_are_played_and_measured(policy, tmp_path, capsys):
     launches = np.vstack(
-        [draw_rallies(6, TaskConfig(randomization="off"), seed=1).launches, INTO_NET[None], COMING[None]]
+        [draw_rallies(6, TaskConfig(randomization="off"), seed=1).launches, launches_of(INTO_NET, COMING)]
     )
     data = write_states(tmp_path / "s.json", launches, away=1)
     found, before = run(capsys, "--data", str(data), "--policy", policy)
@@ -134,16 +140,16 @@ def test_the_air_is_the_recordings_under_any_randomization(tmp_path):
     tracks = write_csv(tmp_path / "t.csv", seen(launch_of(drag=1.3, lift=1.0)))
 
     np.testing.assert_array_equal(
-        read(settings(data=str(states)), Flight.SIMPLE).rallies.launches[0, 9:], [1.0, 1.0]
+        read(settings(data=str(states)), Flight.FULL).rallies.launches[0, DRAG_FACTOR:KIND], [1.0, 1.0]
     )
-    assert read(settings(data=str(tracks)), Flight.SIMPLE).rallies.launches[0, 9] == pytest.approx(
+    assert read(settings(data=str(tracks)), Flight.FULL).rallies.launches[0, 9] == pytest.approx(
         1.3, abs=0.05
     )
 
 
 def test_a_recordings_seed_depends_on_its_name(tmp_path):
     data = write_states(tmp_path / "s.json", [COMING, launch_of()])
-    found = read(settings(data=str(data)), Flight.SIMPLE).rallies
+    found = read(settings(data=str(data)), Flight.FULL).rallies
 
     assert found.seeds.tolist() == [int(seed_of("0")), int(seed_of("1"))]
 
@@ -152,7 +158,7 @@ def test_recordings_of_one_name_are_distinguished_by_their_file(tmp_path):
     for name in ("a", "b"):
         write_states(tmp_path / f"{name}.json", [COMING, launch_of()])
     write_csv(tmp_path / "c.csv", seen(COMING))
-    found = read(settings(data=str(tmp_path)), Flight.SIMPLE)
+    found = read(settings(data=str(tmp_path)), Flight.FULL)
 
     assert found.rallies.ids == ("0", "1", "b/0", "b/1", "t0")
     assert len(set(found.rallies.seeds.tolist())) == 5
@@ -166,7 +172,7 @@ def test_a_repeated_name_in_a_file_is_dropped_and_counted(tmp_path):
     for entry in entries:
         entry["id"] = 7
     data.write_text(json.dumps(entries))
-    found = read(settings(data=str(data)), Flight.SIMPLE)
+    found = read(settings(data=str(data)), Flight.FULL)
 
     assert found.rallies.ids == ("7", "s/7")
     assert found.dropped == {SAME_NAME: 1}
@@ -177,7 +183,7 @@ def test_tracks_that_leave_or_can_not_be_fitted_are_dropped_and_counted(tmp_path
     hit = seen(COMING, duration=0.12)
     hit.positions[6:, 1] += 8.0 * (hit.times[6:] - hit.times[5])  # a stroke after six samples
     data = write_csv(tmp_path / "t.csv", seen(COMING), leaving, hit)
-    found = read(settings(data=str(data)), Flight.SIMPLE)
+    found = read(settings(data=str(data)), Flight.FULL)
 
     assert found.rallies.ids == ("t0",)
     assert found.dropped == {TRACK_AWAY: 1, TOO_SHORT: 1}
@@ -188,7 +194,7 @@ def test_a_limit_takes_recordings_spread_evenly(tmp_path):
         tmp_path / "s.json", draw_rallies(10, TaskConfig(randomization="off"), seed=2).launches
     )
 
-    assert read(settings(data=str(data), rallies=4), Flight.SIMPLE).rallies.ids == ("0", "2", "5", "7")
+    assert read(settings(data=str(data), rallies=4), Flight.FULL).rallies.ids == ("0", "2", "5", "7")
     assert evenly(10, 0).tolist() == list(range(10))
     assert evenly(3, 10).tolist() == [0, 1, 2]
     assert evenly(0, 5).tolist() == []
@@ -200,10 +206,10 @@ def test_states_can_not_drive_a_ball(tmp_path):
     with pytest.raises(
         RecordingError, match="got states only, for --mode kinematic; allowed: tracks, or --mode"
     ):
-        read(settings(data=str(data), mode="kinematic"), Flight.SIMPLE)
+        read(settings(data=str(data), mode="kinematic"), Flight.FULL)
 
     write_csv(tmp_path / "t.csv", seen(COMING))
-    found = read(settings(data=str(tmp_path), mode="kinematic"), Flight.SIMPLE)
+    found = read(settings(data=str(tmp_path), mode="kinematic"), Flight.FULL)
 
     assert found.rallies.ids == ("t0",)
     assert found.dropped == {NO_TRACK: 1}
@@ -225,11 +231,17 @@ def test_a_bad_file_is_one_line(policy, tmp_path, content, error):
     assert "\n" not in str(raised.value)
 
 
-def test_nothing_to_play_is_an_error_with_its_reason(policy, tmp_path):
+def test_nothing_to_play_is_an_error_with_its_reason(policy, tmp_path, capsys):
     data = write_states(tmp_path / "s.json", [INTO_NET])
 
-    with pytest.raises(RecordingError, match="got 1 recorded balls, none of which crosses the net"):
+    with pytest.raises(
+        RecordingError, match=r"got 1 recorded balls, none of which .* \(touches the net: 1\)"
+    ):
         command.main(["--data", str(data), "--policy", policy], Event())
+    with pytest.raises(RecordingError, match="touches the net: 1"):
+        command.main(["--data", str(data), "--policy", policy, "--json"], Event())
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (found["rallies"], found["recordings"], found["invalid"]) == (0, 1, {"touches the net": 1})
     with pytest.raises(RecordingError, match=r"gone\.csv: no such file"):
         command.main(["--data", str(tmp_path / "gone.csv"), "--policy", policy], Event())
     with pytest.raises(ConfigError, match=r"no recordings to play; give some with .* --data FILE_OR_FOLDER"):

@@ -52,22 +52,24 @@ def test_a_launch_lies_within_the_claimed_sigmas(through_bounce):
 
 def test_spin_above_saturation_is_unknown_before_the_bounce_and_known_after_it():
     launch = launch_of(vel=(-5.0, 0.0, 1.8), spin=(0.0, -180.0, 0.0))
-    track = seen(launch, **NOISE)
-    before = fit(track, FitOptions(through_bounce=False))
-    through = fit(track)
+    track = seen(launch, flight=SIMPLE, **NOISE)
+    before = fit(track, FitOptions(flight=SIMPLE, through_bounce=False))
+    through = fit(track, FitOptions(flight=SIMPLE))
 
-    # in the simple model lift saturates at 62 rad/s for 5 m/s: the smallest spin that explains it, and a large sigma
-    assert -110.0 < before.spin[1] < -50.0
+    # in the simple model lift saturates at 62 rad/s for 5 m/s
+    assert before.spin_interval[0, 1] < -180.0 < before.spin_interval[1, 1] < -45.0
     assert before.sigmas[7] > 60.0
     assert through.spin[1] == pytest.approx(-180.0, abs=4.0 * through.sigmas[7])
     assert through.sigmas[7] < 25.0
 
 
-def test_the_spin_along_the_flight_keeps_its_priors_width():
+def test_the_spin_along_the_flight_is_hardly_known():
     flat = launch_of(pos=(1.3, 0.0, 0.5), vel=(-7.0, 0.0, 0.0), spin=(60.0, 0.0, 0.0))
     found = fit(seen(flat, duration=0.2, **NOISE))
 
-    assert found.sigmas[6] > 75.0  # of 150
+    assert found.spin_interval[0, 0] < -30.0
+    assert found.spin_interval[1, 0] > 60.0
+    assert found.sigmas[6] > 4.0 * found.sigmas[7]
 
 
 @pytest.mark.parametrize(("air", "free"), [(Air.ALL, 13), (Air.DRAG, 9), (Air.NONE, 8)])
@@ -101,9 +103,10 @@ def test_a_mirrored_flight_has_the_mirrored_launch():
     mirrored = fit(Track("mirror", track.times, track.positions * [1.0, -1.0, 1.0]))
     found = fit(track)
 
-    # spin is axial: a mirror image in y turns x and z of it
-    np.testing.assert_allclose(mirrored.velocity * [1.0, -1.0, 1.0], found.velocity, atol=1e-4)
-    np.testing.assert_allclose(mirrored.spin * [-1.0, 1.0, -1.0], found.spin, atol=0.1)
+    # spin is axial: a mirror image in y turns x and z of it. The chains are random, and so is a share of a sigma
+    apart = mirrored.spin * [-1.0, 1.0, -1.0] - found.spin
+    np.testing.assert_allclose(mirrored.velocity * [1.0, -1.0, 1.0], found.velocity, atol=0.01)
+    assert np.all(np.abs(apart) < found.sigmas[SPIN])
 
 
 def test_the_tables_restitution_is_found_where_it_bounces():
@@ -111,6 +114,36 @@ def test_the_tables_restitution_is_found_where_it_bounces():
 
     assert found.table[0] == pytest.approx(1.0, abs=0.012)
     assert found.sigmas[11] < 0.01
+
+
+def test_a_serve_is_fitted_through_both_bounces():
+    launch = launch_of(pos=(1.5, 0.2, 0.25), vel=(-5.2, -0.2, -2.0), spin=(0.0, 40.0, 10.0))
+    found = fit(seen(launch, **NOISE))
+
+    assert found.is_serve
+    assert found.used_samples == found.samples
+    assert found.rms < 3.5e-3  # the camera's noise
+    np.testing.assert_allclose(found.velocity, launch[VELOCITY], atol=0.05)
+    np.testing.assert_allclose(found.spin, launch[SPIN], atol=12.0)
+
+
+def test_a_fast_camera_gives_the_same_launch():
+    launch = launch_of()
+    found = fit(seen(launch, rate=1000.0, noise=2e-3))
+
+    assert found.used_samples == found.samples == 700
+    np.testing.assert_allclose(found.position, launch[POSITION], atol=2e-3)
+    np.testing.assert_allclose(found.velocity, launch[VELOCITY], atol=0.03)
+
+
+def test_a_flight_alone_admits_a_spin_that_is_twice_as_fast():
+    """Backspin of 200 rad/s with a lift factor of 1.6: a rate that the slope of the residuals denies."""
+    launch = launch_of(vel=(-4.8, 0.1, 1.1), spin=(0.0, 200.0, 0.0), lift=1.6)
+    found = fit(seen(launch, duration=0.35, noise=2e-3))
+
+    assert found.rms < 5e-3
+    assert found.spin_interval[0, 1] < 200.0 < found.spin_interval[1, 1]
+    assert abs(found.spin[1] - 200.0) < 2.0 * found.sigmas[SPIN][1]
 
 
 def test_too_short_a_flight_is_an_error():

@@ -6,12 +6,13 @@ import pytest
 from common.evaluation.rally_recorder import record_rallies
 from common.physics import touch
 from common.physics.constants import GRID_STEP
-from common.physics.flight import SIMPLE
+from common.physics.flight import FULL
 from common.physics.fly import NO_ROBOT
 from common.rally.state import NO_SAMPLE, SAMPLE
 from common.rally.step import snap_to_recorded_track
 from common.task.config import TaskConfig
-from common.task.launch import RallyBlock, draw_rallies
+from common.task.launch import KIND, RallyBlock, draw_rallies
+from common.task.launch_presets import Kind
 from common.task.states import State
 from tests.unit.topspin.real2sim.flights import TABLE, launch_of, seen
 from tests.unit.topspin.render.recorded import wave
@@ -92,11 +93,11 @@ def test_a_noisy_track_gives_a_path_nearer_to_the_ball_than_its_samples():
     path = path_of(track, fit(track))
     n, bounce = len(path), int(np.flatnonzero(path[:, 6])[0])
     truth, velocities = np.empty((n, 3)), np.empty((n, 3))
-    predict(LAUNCH, TABLE, SIMPLE, GRID_STEP * np.arange(n), truth, velocities)
+    predict(LAUNCH, TABLE, FULL, GRID_STEP * np.arange(n), truth, velocities)
     off = np.abs(np.arange(n) - bounce) > 1  # in the bounce's own step the two balls differ
 
     assert n == int(track.times[-1] / GRID_STEP + 1e-9) + 1
-    assert bounce == np.ceil(touch_down(LAUNCH, SIMPLE, 1.0)[0] / GRID_STEP)
+    assert bounce == np.ceil(touch_down(LAUNCH, FULL, 1.0)[0] / GRID_STEP)
     assert np.sqrt(np.mean((path[:, :3] - truth) ** 2)) < 1e-3
     assert np.sqrt(np.mean((path[:, 3:6] - velocities)[off] ** 2)) < 0.06
 
@@ -131,17 +132,40 @@ def test_a_driven_rallys_validity_is_its_paths():
     assert found.valid.tolist() == [True, False]  # the second flies over the table
     assert found.block().path_rows == found.paths.shape[1]
     np.testing.assert_array_equal(found.launches[:, :6], found.paths[:, 0, :6])
-    np.testing.assert_array_equal(found.launches[:, 6:], [fitted.launch[6:] for fitted in fits])
+    np.testing.assert_array_equal(
+        found.launches[:, 6:], [[*fitted.launch[6:], int(Kind.RECORDED)] for fitted in fits]
+    )
+
+
+def test_a_serves_path_has_three_parts_and_is_valid():
+    served = launch_of(pos=(1.5, 0.2, 0.25), vel=(-5.2, -0.2, -2.0), spin=(0.0, 40.0, 10.0))
+    track = seen(served, noise=1e-3)
+    fits = [fit(track)]
+    found = driven(of_fits(fits), [track], fits)
+    stages = found.paths[0, :, 6]
+
+    assert found.valid.tolist() == [True]
+    assert found.launches[0, KIND] == Kind.SERVE
+    assert list(dict.fromkeys(stages.tolist())) == [4.0, 0.0, 1.0]
+    rallies = record_rallies(wave, found.block(), CONFIG)
+    first = int(np.flatnonzero(stages == 0.0)[0])
+    np.testing.assert_array_equal(rallies[0].ball_pos[1 : first - 1], found.paths[0, 1 : first - 1, :3])
+    np.testing.assert_array_equal(
+        rallies[0].ball_pos[first + 2 : first + 40], found.paths[0, first + 2 : first + 40, :3]
+    )
 
 
 def test_a_driven_balls_first_touch_is_its_paths():
     grid = GRID_STEP * np.arange(100)
     low, pos, vel = launch_of(vel=(-5.0, 0.0, 0.9)), np.empty((100, 3)), np.empty((100, 3))
-    predict(low, np.empty(0), SIMPLE, grid, pos, vel)
+    predict(low, np.empty(0), FULL, grid, pos, vel)
     path = np.column_stack([pos, vel, np.zeros(100)])
 
-    assert first_touch(LAUNCH, np.zeros((0, SAMPLE)), SIMPLE, NO_ROBOT) == touch.ROBOT_COURT
-    assert first_touch(LAUNCH, path, SIMPLE, NO_ROBOT) == touch.NET
+    def touched(path):
+        return first_touch(np.append(LAUNCH, int(Kind.RECORDED)), path, FULL, tuple(TABLE), NO_ROBOT)
+
+    assert touched(np.zeros((0, SAMPLE))) == touch.ROBOT_COURT
+    assert touched(path) == touch.NET
 
 
 def test_recorded_tracks_need_tailored_collisions():

@@ -5,7 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from common.physics.flight import FULL
 from tests.unit.topspin.real2sim.flights import launch_of, seen
+from topspin.real2sim.fit.predict import predict
 from topspin.real2sim.formats.ball_gun import FRAME as GUN_FRAME
 from topspin.real2sim.formats.deepmind import COLUMNS
 from topspin.real2sim.formats.deepmind import FRAME as DEEPMIND_FRAME
@@ -150,6 +152,136 @@ def test_states_that_fly_away_are_dropped_or_turned(tmp_path):
     np.testing.assert_allclose(turned.states.spins[1], [4.0, 30.0, 7.0])
 
 
+def test_a_folders_sidecar_applies_to_files_without_their_own(tmp_path):
+    for name in ("a", "b"):
+        write_csv(tmp_path / f"{name}.csv", "t;x;y;z", rows_of(TRACK))
+    (tmp_path / "folder.toml").write_text('label = "of the folder"')
+    (tmp_path / "b.toml").write_text('label = "its own"')
+
+    labels = [found.tracks[0].label for found in load_folder(tmp_path)]
+
+    assert labels == ["of the folder", "its own"]
+
+
+def test_a_sidecar_names_the_columns_of_a_file_without_names(tmp_path):
+    rows = rows_of(TRACK)[:, [1, 2, 3, 0]]
+    numbers = "\n".join(";".join(map(repr, map(float, row))) for row in rows)
+    (tmp_path / "throw.toml").write_text('columns = ["x", "y", "z", "t"]')
+    (tmp_path / "throw.csv").write_text(numbers)
+    (track,) = load(tmp_path / "throw.csv").tracks
+
+    np.testing.assert_array_equal(track.positions, TRACK.positions)
+    np.testing.assert_array_equal(track.times, TRACK.times)
+
+    (tmp_path / "throw.csv").write_text("a;b;c;d\n" + numbers)  # a first line with other names is replaced
+
+    np.testing.assert_array_equal(load(tmp_path / "throw.csv").tracks[0].times, TRACK.times)
+
+
+def test_units_of_the_header_win_over_the_sidecars(tmp_path):
+    rows = rows_of(TRACK) * [1e3, 1e2, 1e2, 1e2]
+    path = write_csv(
+        tmp_path / "throw.csv", "t [ms];x (cm);y (cm);z (cm)", rows, sidecar='length_unit = "mm"'
+    )
+    (track,) = load(path).tracks
+
+    np.testing.assert_allclose(track.times, TRACK.times, atol=1e-12)
+    np.testing.assert_allclose(track.positions, TRACK.positions, atol=1e-12)
+
+
+@pytest.mark.parametrize("has_decimal_comma", [True, False])
+def test_numbers_may_have_a_decimal_comma(tmp_path, has_decimal_comma):
+    path = write_csv(tmp_path / "throw.csv", "t;x;y;z", rows_of(TRACK))
+    if has_decimal_comma:
+        path.write_text(path.read_text().replace(".", ","))
+
+    np.testing.assert_array_equal(load(path).tracks[0].positions, TRACK.positions)
+
+
+@pytest.mark.parametrize("delay", [0.015, -0.015])
+def test_a_velocity_of_another_moment_is_taken_back_to_the_positions(tmp_path, delay):
+    launch = launch_of(vel=(-12.0, 0.5, 1.0), spin=(20.0, -300.0, 40.0))
+    later = seen(launch, duration=2 * abs(delay), rate=1 / abs(delay))
+    velocities = np.empty((2, 3))
+    predict(launch, np.empty(0), FULL, later.times, np.empty((2, 3)), velocities)
+    given, wanted = (velocities[1], launch[3:6]) if delay > 0 else (launch[3:6], velocities[1])
+    row = [*launch[:3], *given, *launch[6:9]]
+    path = write_csv(tmp_path / "s.csv", "x,y,z,vx,vy,vz,wx,wy,wz", [row], ",", f"velocity_delay_s = {delay}")
+
+    # the acceleration of 40 m/s^2 changes by 4 % meanwhile
+    np.testing.assert_allclose(load(path).states.velocities[0], wanted, atol=0.02)
+    assert np.linalg.norm(given - wanted) > 0.3
+
+
+# ---- frames that can't be the file's
+
+
+def test_a_track_with_y_up_names_its_axes(tmp_path):
+    rows = np.column_stack(
+        [TRACK.times, -TRACK.positions[:, 0], TRACK.positions[:, 2], TRACK.positions[:, 1]]
+    )
+    path = write_csv(tmp_path / "throw.csv", "t;x;y;z", rows)
+
+    with pytest.raises(
+        RecordingError, match=r"flies along x, not -x and falls along -y, not -z; set axes = (.*) in"
+    ):
+        load(path)
+    path.with_suffix(".toml").write_text('axes = ["-x", "z", "y"]')
+    np.testing.assert_allclose(load(path).tracks[0].positions, TRACK.positions)
+
+
+def test_states_that_fly_along_y_name_their_axes(tmp_path):
+    row = (0.1, -1.2, 0.4, 0.5, 5.0, 1.5, 30.0, -4.0, 7.0)
+    path = write_csv(tmp_path / "s.csv", "x,y,z,vx,vy,vz,wx,wy,wz", [row], ",")
+
+    with pytest.raises(
+        RecordingError, match=r'1 of 1 balls fly along y, not -x; set axes = \["-y", "x", "z"\] in s'
+    ):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("factors", "words"),
+    [
+        ((1.0, 100.0), r"metres of this file look like centimetres .*; set length_unit = \"cm\" in t\.toml"),
+        (
+            (1e3, 1.0),
+            r"times of this file look like ms \(a step of 5\.56 s\); set time_unit = \"ms\" in t\.toml",
+        ),
+        (
+            (180.0, 1.0),
+            r"times of this file look like frame numbers .*; set time_unit = \"frame\" and rate_hz",
+        ),
+    ],
+)
+def test_a_unit_that_is_not_the_files_is_named(tmp_path, factors, words):
+    time, length = factors
+    path = write_csv(tmp_path / "t.csv", "t;x;y;z", rows_of(TRACK) * [time, length, length, length])
+
+    with pytest.raises(RecordingError, match=words):
+        load(path)
+
+
+def test_an_origin_at_the_tables_corner_is_said(tmp_path):
+    rows = rows_of(TRACK) + np.array([0.0, 0.0, 1.5, 0.0])
+    path = write_csv(tmp_path / "t.csv", "t;x;y;z", rows)
+
+    with pytest.raises(
+        RecordingError, match=r"bounces beside the table, at x = .* and y = 1\.5. m; set origin in t"
+    ):
+        load(path)
+
+
+def test_a_ball_that_misses_the_table_and_bounces_on_the_floor_is_no_error(tmp_path):
+    on_table = seen(launch_of())
+    t = on_table.times
+    fall = np.column_stack([t, 0.2 - 3.0 * t, 1.2 + 0.0 * t, 0.02 * np.ones_like(t)])
+    fall[:, 3] += np.where(t < 0.39, -0.5 * 9.81 * t**2, -0.746 + 3.0 * (t - 0.39) - 4.905 * (t - 0.39) ** 2)
+    path = write_csv(tmp_path / "t.csv", "t;x;y;z", fall)
+
+    assert len(load(path).tracks) == 1
+
+
 # ---- what is dropped
 
 
@@ -241,11 +373,32 @@ FILES = [
     ("x.xml", "<x/>", r"x\.xml: got a \.xml file; allowed: \.json, \.hdf5, \.h5, \.csv, \.txt"),
     ("x.csv", b"t;x;y;z\n\xff\xfe", r"x\.csv: not readable as text"),
     ("x.csv", "t;x;z\n0;1;2\n", r"x\.csv:1: no column y; got t, x, z"),
-    ("x.csv", "0.0;1.0;2.0;3.0\n", r"x\.csv:1: no column x, y, z; got 0\.0"),
+    (
+        "x.csv",
+        "0.0;1.0;2.0;3.0\n",
+        r"x\.csv:1: got numbers, no column names; add the first line t;x;y;z \(or columns = \[\"t\", \"x\"",
+    ),
+    (
+        "x.csv",
+        "0.0,1.0\n",
+        r"x\.csv:1: got numbers, no column names; add the first line t;x;y;z, or the names",
+    ),
     ("x.csv", "t;x;y;z;time\n", r"x\.csv:1: 't' and 'time' are the same column"),
     ("x.csv", "t;x;y;z\n0;1;2\n", r"x\.csv:2: got 3 columns; allowed: 4"),
     ("x.csv", "t;x;y;z\n0;1;2;3\n1;1;abc;3\n", r"x\.csv:3: y: got 'abc'; allowed: a number"),
-    ("x.csv", "t;x;y;z\n0,1;1;2;3\n", r"x\.csv:2: t: got '0,1'; allowed: a number"),
+    ("x.csv", "t;x;y;z\n0,1;1.5;2;3\n", r"x\.csv:2: t: got '0,1'; allowed: a number"),
+    ("x.csv", "t,x,y,z\n0,1,1,5,2,0,3,0\n", r"got 8 columns; allowed: 4 .* \(decimal commas need ; between"),
+    ("x.csv", "t [h];x;y;z\n0;1;2;3\n", r"x\.csv:1: t \[h\]: got the unit 'h'; allowed: s, ms, us, ns"),
+    (
+        "x.csv",
+        "pos;t\n[1 2 3];0\n[1 2];1\n",
+        r"x\.csv:3: pos: got '\[1 2\]'; allowed: three numbers .* x, y, z",
+    ),
+    (
+        "x.csv",
+        "t;x;y;z\n".encode("utf-16-le"),
+        r"x\.csv: not readable as text \(zero bytes\); allowed: UTF-8",
+    ),
     ("x.csv", "x;y;z\n0;1;2\n", r"x\.csv: no column t, and no rate_hz in x\.toml"),
     ("x.csv", "t;x;y;z\n", r"x\.csv: no recording is usable \(there is none\)"),
     ("x.csv", "x;y;z;wx\n0;1;2;3\n", r"x\.csv: states need the columns vx, vy, vz, which are missing"),
@@ -279,6 +432,9 @@ SIDECARS = [
     ("rate_hz = 0", "rate_hz: got 0; allowed: a number above 0"),
     ("rate_hz = true", "rate_hz: got True; allowed: a number above 0"),
     ("time_unit = 'frame'", "time_unit 'frame' needs rate_hz, which is missing"),
+    ("player = 3", "player: got 3; allowed: a string"),
+    ("columns = 't'", "columns: got 't'; allowed: a list such as"),
+    ("velocity_delay_s = 15", "velocity_delay_s: got 15; allowed: -0.1 to 0.1"),
     ("label = 3", "label: got 3; allowed: a string"),
     ("axes = 'xyz'", "axes: got 'xyz'; allowed: a list such as"),
     ("axes = ['x', 'y', 'up']", "axes: got 'up'; allowed: x, y, z, -x, -y, -z"),

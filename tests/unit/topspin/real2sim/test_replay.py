@@ -5,7 +5,7 @@ import pytest
 
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.physics.flight import FULL, SIMPLE
-from common.task.launch import POSITION, SPIN, VELOCITY, Purpose, draw_rallies
+from common.task.launch import DRAG_FACTOR, KIND, POSITION, SPIN, VELOCITY, Purpose, draw_rallies
 from common.task.randomization import PROFILES, RALLY_PARAMETERS, draw_parameters
 from tests.unit.topspin.real2sim.flights import launch_of, seen
 from topspin.real2sim.fit.bounces import touches
@@ -18,10 +18,11 @@ from topspin.real2sim.replay import of_fits, of_states, seed_of
 def states_of(*launches):
     rows = np.array(launches)
     ids = tuple(f"s{k}" for k in range(len(rows)))
-    return States(ids, rows[:, POSITION], rows[:, VELOCITY], rows[:, SPIN], ("",) * len(rows))
+    unknown = ("",) * len(rows)
+    return States(ids, rows[:, POSITION], rows[:, VELOCITY], rows[:, SPIN], unknown, unknown)
 
 
-GOOD, INTO_NET, TOO_FAR = launch_of(), launch_of(vel=(-5.0, 0.0, -1.0)), launch_of(vel=(-14.0, 0.0, 2.0))
+GOOD, INTO_NET, TOO_FAR = launch_of(), launch_of(vel=(-5.0, 0.0, 0.5)), launch_of(vel=(-14.0, 0.0, 2.0))
 
 
 def test_a_state_is_launched_as_it_was_recorded():
@@ -56,14 +57,14 @@ def test_no_other_purpose_has_a_recorded_rallys_seed():
 
 
 def test_air_is_drawn_within_the_profile():
-    found = of_states(states_of(*[GOOD] * 64), randomization="standard")
-    still = of_states(states_of(GOOD), randomization="off")
+    found = of_states(states_of(*[GOOD] * 64), air="standard")
+    still = of_states(states_of(GOOD), air="off")
 
     low, high = PROFILES["standard"].drag_factor
-    drag = found.launches[:, 9]
+    drag = found.launches[:, DRAG_FACTOR]
     assert low <= drag.min() < 0.9
     assert 1.1 < drag.max() < high
-    np.testing.assert_array_equal(still.launches[0, 9:], [1.0, 1.0])
+    np.testing.assert_array_equal(still.launches[0, DRAG_FACTOR:KIND], [1.0, 1.0])
 
 
 def test_a_fitted_track_bounces_where_the_recording_did():
@@ -71,8 +72,8 @@ def test_a_fitted_track_bounces_where_the_recording_did():
     track = seen(launch, noise=1e-3, jitter=0.35e-3)
     found = of_fits([fit(track)])
     parameters = np.zeros((1, RALLY_PARAMETERS))
-    draw_parameters(found.seeds[0], *found.launches[0, 9:], PROFILES["off"], parameters[0])
-    bounces, _ = unplayed_flight(found.launches, parameters, SIMPLE)
+    draw_parameters(found.seeds[0], *found.launches[0, DRAG_FACTOR:], PROFILES["off"], parameters[0])
+    bounces, _ = unplayed_flight(found.launches, parameters, FULL)
 
     assert found.valid[0]
     np.testing.assert_allclose(bounces[0], touches(track).bounces[0].position, atol=6e-3)
