@@ -53,6 +53,13 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     panel: Literal["auto", "on", "off"] = Field(
         "auto", description="live terminal panel; auto: if there is a terminal"
     )
+    watchdog_s: float = Field(
+        60.0,
+        ge=0,
+        description="a process that sends no heartbeat and uses no CPU time for so long hangs, and is restarted; "
+        "0: never",
+        json_schema_extra={"unit": "s"},
+    )
     evaluate: bool = Field(True, description="evaluate while the run trains, and measure the final policy")
     final_rallies: int = Field(1000, ge=1, description="rallies of the final measure")
     task: TaskConfig = TaskConfig()

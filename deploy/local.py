@@ -25,6 +25,7 @@ from common.service.run_folder import RunFolder
 from deploy.panel import View, render
 from deploy.prepare import PreparedRun, RunFailedError, last_epoch, prepared, settings
 from deploy.supervisor import Supervisor
+from deploy.watchdog import Watchdog
 from deploy.watcher import Watcher
 from services.learner.budget import NOTHING_LEFT
 
@@ -47,7 +48,8 @@ class _Ended(Event):
         self._stop, self._supervisor = stop, supervisor
 
     def is_set(self) -> bool:
-        return self._stop.is_set() or self._supervisor.status_of(LEARNER) is not None
+        self._supervisor.watch(time.monotonic())
+        return self._stop.is_set() or self._supervisor.has_ended(LEARNER)
 
 
 def run_summary(run: PreparedRun, learner: Status | None) -> dict[str, Any]:
@@ -106,10 +108,12 @@ def watch(
     with Live(console=console, auto_refresh=False) if has_panel else nullcontext() as live:
         # a panel has replaced stderr: log to the new one
         set_up_logging("info", "deploy", log_file)
-        while not stop.is_set() and supervisor.status_of(LEARNER) is None:
+        watchdog = Watchdog(LEARNER, run.config.watchdog_s)
+        while not stop.is_set() and not supervisor.has_ended(LEARNER):
             now = time.monotonic()
             supervisor.watch(now)
             watcher.look(now)
+            end_hung(watchdog, supervisor, view, now)
             view.restarts = {name: child.restarts for name, child in supervisor.children.items()}
             if name := supervisor.has_bad_config():
                 raise RunFailedError(f"{name} can't use its settings: {supervisor.last_line(name)}")
@@ -120,6 +124,23 @@ def watch(
             transport.wait(WATCH_S)
             stop.wait(0.05)  # heartbeats of many services must not keep this loop busy
     set_up_logging("info", "deploy", log_file)
+
+
+def end_hung(watchdog: Watchdog, supervisor: Supervisor, view: View, now: float) -> None:
+    """Kill the processes that hang; the supervisor starts them again."""
+    running = [
+        (name, child.process.pid, child.started)
+        for name, child in supervisor.children.items()
+        if child.process.poll() is None
+    ]
+    heard = {f"{role}-{id_}": when for (role, id_), when in view.heard.items()}
+    for name in watchdog.look(running, heard, now):
+        log.warning(
+            "process hangs name=%s: no heartbeat and no CPU time for %.0f s; killing it",
+            name,
+            watchdog.limit_s,
+        )
+        supervisor.kill(name)
 
 
 def end(supervisor: Supervisor, stop: Event) -> None:
@@ -163,7 +184,11 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
         log.warning("stopped before anything was learned; start again with: %s", again)
         return INTERRUPTED
     if status != DONE:
-        raise RunFailedError(f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}")
+        has_checkpoint = any(run.folder.checkpoints.glob("*.safetensors"))
+        advice = f"; go on with: {again}" if has_checkpoint else ""
+        raise RunFailedError(
+            f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}"
+        )
     line = run_summary(run, learner)
     if run.config.evaluate and not stop.is_set():
         line |= final_measures(run, stop)

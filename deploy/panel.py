@@ -12,6 +12,7 @@ from rich.text import Text
 from common.comms.messages import Status
 
 STAGES = {1: "1 catch", 2: "2 hit", 3: "3 aim"}
+MOST_SERVICES = 2048
 STALE_S = 5.0  # a heartbeat older than this is shown as missing
 
 
@@ -27,7 +28,9 @@ class View:
     frames: int = 0
 
     def hear(self, status: Status, now: float) -> None:
-        """Store a heartbeat."""
+        """Store a heartbeat; those of more services than a run has are left out."""
+        if len(self.statuses) >= MOST_SERVICES and (status.role, status.id) not in self.statuses:
+            return
         self.statuses[status.role, status.id] = status
         self.heard[status.role, status.id] = now
 
@@ -81,6 +84,7 @@ def render(view: View, now: float) -> RenderableType:
     learner = view.statuses.get(("learner", "0"))
     gauges: Mapping[str, float] = learner.gauges if learner else {}
     counters: Mapping[str, float] = learner.counters if learner else {}
+    misfits = gauges.get("misfits", 0.0)
     evaluator = view.statuses.get(("evaluator", "0"))
     measured: Mapping[str, float] = evaluator.gauges if evaluator else {}
 
@@ -145,6 +149,9 @@ def render(view: View, now: float) -> RenderableType:
         )
     bar = ProgressBar(total=1.0, completed=share_done(view), width=60)
     rows: list[RenderableType] = [head, bar, Text(""), play, Text(""), learning, ledger, Text(""), processes]
+    if misfits:
+        text = f"{misfits:.0f} actors of another contract get no credits: the learner's log names them"
+        rows.insert(-2, Text(text, style="red"))
     return Panel(Group(*rows), title=f"Topspin {view.run}", border_style="cyan", padding=(0, 1))
 
 

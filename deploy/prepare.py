@@ -4,7 +4,7 @@ import os
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final
 
@@ -55,12 +55,16 @@ class PreparedRun:
 
         def service(role: str, index: int, *more: str) -> Spec:
             arguments = ("--config", file, "--id", str(index), "--metrics-port", str(next(ports)), *more)
-            # The learner holds the run's state: the run ends with it, and --resume continues.
-            return Spec(f"{role}-{index}", role, (f"services.{role}", *arguments), restart=role != "learner")
+            return Spec(f"{role}-{index}", role, (f"services.{role}", *arguments), restart=True)
 
-        # A run that was stopped before its first checkpoint starts from the beginning.
-        resumes = config.resume and any(self.folder.checkpoints.glob("*.safetensors"))
-        found = [service("learner", 0, *(("--resume",) if resumes else ()))]
+        def resumed() -> tuple[str, ...]:
+            """Return the flag to go on from the newest checkpoint, if there is one."""
+            return ("--resume",) if any(self.folder.checkpoints.glob("*.safetensors")) else ()
+
+        # The learner holds the run's state: the run ends when it is done. A run that was stopped before its first
+        # checkpoint starts from the beginning.
+        learner = service("learner", 0, *(resumed() if config.resume else ()))
+        found = [replace(learner, keeps_run=True, again=resumed)]
         if config.evaluate:
             found.append(service("evaluator", 0))
         found += [service("generator", i, "--index", str(i)) for i in range(config.generators)]

@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from common.service.config import ENVIRONMENT_PREFIX
-from common.service.process import BAD_CONFIG
+from common.service.process import BAD_CONFIG, DONE
 from deploy.child import SPARE, Assignment
 
 log = logging.getLogger(__name__)
@@ -22,6 +22,8 @@ RESTART_PAUSE_S = (
 )
 RESTART_PAUSE_MAX_S = 30.0  # longest pause; it doubles with each failure
 STABLE_S = 20.0  # after this lifetime the pause is the first one again
+KEEPER_STABLE_S = 600.0  # the same for the process that keeps the run's state
+KEEPER_DEATHS = 5  # most in a row of this process: then the run ends
 SPARE_AFTER_S = 10.0  # then one process starts and waits to replace one that dies
 SPARE_ROLE = "actor"  # imports torch and MuJoCo, which takes 2 s of a whole core; a run has many actors
 
@@ -34,6 +36,26 @@ class Spec:
     role: str
     arguments: tuple[str, ...]  # module and flags, as after python -m
     restart: bool  # whether it comes back when it dies
+    keeps_run: bool = False  # whether the run ends with it: when it is done, or when restarts do not help
+    again: Callable[[], tuple[str, ...]] = lambda: ()  # more flags of a restart
+
+
+def next_start(spec: Spec, status: int, life_s: float, deaths: int) -> float | None:
+    """Return how long to wait before a process is started again [s], or None if it stays ended.
+
+    Args:
+        spec: The process.
+        status: Its exit status; negative: the signal that ended it.
+        life_s: How long it lived [s].
+        deaths: How often it has died in a row, with this one.
+    """
+    if not spec.restart or status == BAD_CONFIG:
+        return None
+    if spec.keeps_run:
+        fails_at_start = status > 0 and life_s < STABLE_S  # the next one would fail in the same way
+        if status == DONE or fails_at_start or deaths > KEEPER_DEATHS:
+            return None
+    return restart_pause(deaths)
 
 
 def restart_pause(deaths: int) -> float:
@@ -52,6 +74,7 @@ class Child:
     deaths_in_a_row: int = 0
     restart_at: float | None = None
     exits: list[int] = field(default_factory=list)
+    has_ended: bool = False  # it is not started again
 
 
 class Supervisor:
@@ -68,7 +91,7 @@ class Supervisor:
         self._next_spare = time.monotonic() + SPARE_AFTER_S
         self.children = {spec.name: Child(spec, self._start(spec), time.monotonic()) for spec in specs}
 
-    def _start(self, spec: Spec) -> subprocess.Popen[bytes]:
+    def _start(self, spec: Spec, *more: str) -> subprocess.Popen[bytes]:
         log_file = self._logs / f"{spec.name}.log"
         spare, self._spare = (self._spare, None) if spec.role == SPARE_ROLE else (None, self._spare)
         if spare is not None and spare.poll() is None and spare.stdin is not None:
@@ -76,7 +99,7 @@ class Supervisor:
                 spare.stdin.write(Assignment(str(log_file), spec.arguments[1:]).to_line())
                 spare.stdin.flush()
                 return spare
-        return _launch(spec.arguments, log_file)
+        return _launch((*spec.arguments, *more), log_file)
 
     def watch(self, now: float) -> None:
         """Record which processes ended, and restart those with ``restart``."""
@@ -88,26 +111,43 @@ class Supervisor:
                 self._spare = _launch((SPARE, module), self._logs / "spare.log")
         for child in self.children.values():
             status = child.process.poll()
-            if status is None:
+            if status is None or child.has_ended:
                 continue
-            if child.restart_at is None and len(child.exits) == child.restarts:
-                child.exits.append(status)
-                if not child.spec.restart or status == BAD_CONFIG:
-                    continue
-                child.deaths_in_a_row = 1 if now - child.started > STABLE_S else child.deaths_in_a_row + 1
-                child.restart_at = now + restart_pause(child.deaths_in_a_row)
-                log.warning(
-                    "process died name=%s pid=%d status=%d last_line=%r; restarting it",
-                    child.spec.name,
-                    child.process.pid,
-                    status,
-                    self.last_line(child.spec.name),
-                )
+            if child.restart_at is None:
+                self._note_death(child, status, now)
             if child.restart_at is not None and now >= child.restart_at:
                 _close_pipe(child.process)
-                child.process = self._start(child.spec)
+                child.process = self._start(child.spec, *child.spec.again())
                 child.started, child.restart_at = now, None
                 child.restarts += 1
+
+    def _note_death(self, child: Child, status: int, now: float) -> None:
+        """Record that a process has ended, and when it is started again."""
+        child.exits.append(status)
+        life_s = now - child.started
+        is_stable = life_s > (KEEPER_STABLE_S if child.spec.keeps_run else STABLE_S)
+        child.deaths_in_a_row = 1 if is_stable else child.deaths_in_a_row + 1
+        pause = next_start(child.spec, status, life_s, child.deaths_in_a_row)
+        if pause is None:
+            child.has_ended = True
+            return
+        child.restart_at = now + pause
+        log.warning(
+            "process died name=%s pid=%d status=%d last_line=%r; restarting it",
+            child.spec.name,
+            child.process.pid,
+            status,
+            self.last_line(child.spec.name),
+        )
+
+    def has_ended(self, name: str) -> bool:
+        """Return whether a process has ended and is not started again; `watch` notes it."""
+        return self.children[name].has_ended
+
+    def kill(self, name: str) -> None:
+        """End a process that hangs; `watch` starts it again."""
+        with suppress(ProcessLookupError):
+            self.children[name].process.kill()
 
     def has_bad_config(self) -> str:
         """Return the name of a process whose settings can't be used, so that no restart helps, or ""."""

@@ -13,6 +13,7 @@ declare, so the receiver needs no checks of its own. Decoded arrays are read-onl
 
 import dataclasses
 import math
+import re
 import struct
 import typing
 import zlib
@@ -24,6 +25,7 @@ from typing import Any, Final, TypeVar, overload
 import msgpack
 import numpy as np
 
+from common.comms.budgets import LONGEST_TEXT, budget_of, items_in, one_line
 from common.comms.wire import Dims, Message, Wire, slots_of
 
 MAGIC: Final = b"TSPN"
@@ -76,9 +78,10 @@ def decode_one_of(
 
 def _decode(payload: bytes, expected: tuple[type[Message], ...], limit_bytes: int) -> Any:
     names = " or ".join(kind.__name__ for kind in expected)
-    if len(payload) > limit_bytes:
-        raise DecodeError(f"{names}: {len(payload)} bytes; allowed: up to {limit_bytes}")
-    content = _unpack(_body(payload, names), names)
+    most = max(budget_of(kind.__name__).bytes for kind in expected)
+    if len(payload) > (allowed := min(limit_bytes, most)):
+        raise DecodeError(f"{names}: {len(payload)} bytes; allowed: up to {allowed}")
+    content = _unpack(_body(payload, names), names, max(budget_of(kind.__name__).items for kind in expected))
     if not (isinstance(content, list) and len(content) == 3 and isinstance(content[2], dict)):
         raise DecodeError(f"{names}: the body is not [type, version, fields]")
     got_type, got_version, fields = content
@@ -100,7 +103,8 @@ def salvage(payload: bytes, expected: type[_M], names: tuple[str, ...]) -> dict[
     corrupt.
     """
     try:
-        content = _unpack(_body(payload, expected.__name__), expected.__name__)
+        name = expected.__name__
+        content = _unpack(_body(payload, name), name, budget_of(name).items)
         raw = content[2]
         return {
             slot.name: _read(raw[slot.name], slot.kind, slot.wire, slot.name, Dims())
@@ -125,7 +129,9 @@ def _body(payload: bytes, name: str) -> memoryview:
     return body
 
 
-def _unpack(body: memoryview, name: str) -> Any:
+def _unpack(body: memoryview, name: str, most_items: int) -> Any:
+    if len(body) > most_items and items_in(body, most_items) > most_items:
+        raise DecodeError(f"{name}: more than {most_items} items; allowed: up to {most_items}")
     try:
         return msgpack.unpackb(body, max_array_len=_MAX_ITEMS, max_map_len=_MAX_ITEMS, ext_hook=_no_extension)
     # msgpack documents ValueError and its own exceptions; deep nesting and unusual keys raise the others
@@ -164,6 +170,8 @@ def _pack(value: Any, kind: Any, wire: Wire, path: str, dims: Dims) -> Any:
         return _pack_fields(value, path, dims)
     if isinstance(value, Enum):
         return value.value
+    if isinstance(value, str) and (fault := _text_fault(value, wire)):
+        raise EncodeError(f"{path}: {fault}")
     return float(value) if kind is float else value
 
 
@@ -209,7 +217,7 @@ def _read(raw: Any, kind: Any, wire: Wire, path: str, dims: Dims) -> Any:
         pairs = _of_type(raw, dict, path).items()
         return MappingProxyType(
             {
-                _of_type(key, str, path): _read(number, float, wire, f"{path}[{_short(key)}]", dims)
+                _name(key, path): _read(number, float, wire, f"{path}[{_short(key)}]", dims)
                 for key, number in pairs
             }
         )
@@ -220,7 +228,26 @@ def _read(raw: Any, kind: Any, wire: Wire, path: str, dims: Dims) -> Any:
     value = _of_type(raw, kind, path)
     if kind in (int, float):
         _check_number(value, wire, path)
+    elif kind is str and (fault := _text_fault(value, wire)):
+        raise DecodeError(f"{path}: {fault}")
     return value
+
+
+def _name(raw: Any, path: str) -> str:
+    """Return the name of a number."""
+    name: str = _of_type(raw, str, path)
+    if fault := _text_fault(name, Wire()):
+        raise DecodeError(f"{path}: name of {fault}")
+    return name
+
+
+def _text_fault(text: str, wire: Wire) -> str:
+    """Return why a text is not allowed, or ""."""
+    if len(text) > LONGEST_TEXT:
+        return f"{len(text)} characters; allowed: up to {LONGEST_TEXT}"
+    if wire.text:
+        return "" if re.fullmatch(wire.text, text) else f"{_short(text)}; allowed: {wire.text}"
+    return "" if text.isprintable() else f"{_short(text)}; allowed: one line of printable characters"
 
 
 def _of_type(raw: Any, kind: type, path: str) -> Any:
@@ -288,5 +315,8 @@ def _range(wire: Wire) -> str:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    if isinstance(value, str | bytes | list | tuple) and len(value) > 60:
+        value = value[:60]  # no long text of a value that a peer made large
+    elif isinstance(value, dict) and len(value) > 60:
+        return f"a map of {len(value)}"
+    return one_line(repr(value), 60)

@@ -14,13 +14,15 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
+from common.comms.budgets import ID_PATTERN, one_line
 from common.errors import ReportedError
 
 PREFIX: Final = "topspin/v1"
 ROLES: Final = ("generator", "actor", "learner", "evaluator")
 
 # A part contains no wildcard (* $ # ?), no separator (/) and not Zenoh's verbatim mark (@).
-_PART: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_PART: Final = re.compile(ID_PATTERN)
+LONGEST_NUMBER: Final = 19  # digits of an incarnation: it fits into 64 bits
 
 
 class KeyPartError(ReportedError, ValueError):
@@ -74,6 +76,10 @@ class Keys:
         """Return the expression that matches all liveliness tokens of the run."""
         return f"{PREFIX}/{self.run}/alive/**"
 
+    def every_alive_of(self, role: str) -> str:
+        """Return the expression that matches the liveliness tokens of one role."""
+        return f"{PREFIX}/{self.run}/alive/{_role(role)}/**"
+
     def status(self, role: str, id_: str) -> str:
         """Return the key of one service's heartbeats."""
         return f"{PREFIX}/{self.run}/status/{_role(role)}/{_part('id', id_)}"
@@ -86,9 +92,9 @@ class Keys:
         """Return the owner of a liveliness key of this run."""
         head, _, rest = alive_key.partition(f"{PREFIX}/{self.run}/alive/")
         parts = rest.split("/")
-        if head or len(parts) != 3 or not parts[2].isdigit():
+        if head or len(parts) != 3 or not parts[2].isdigit() or len(parts[2]) > LONGEST_NUMBER:
             raise KeyPartError(
-                f"key {alive_key!r} is not {PREFIX}/{self.run}/alive/<role>/<id>/<incarnation>"
+                f"key {one_line(alive_key, 200)!r} is not {PREFIX}/{self.run}/alive/<role>/<id>/<incarnation>"
             )
         return Member(role=_role(parts[0]), id=_part("id", parts[1]), incarnation=int(parts[2]))
 

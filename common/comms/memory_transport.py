@@ -157,7 +157,7 @@ class MemoryBroker:
         """Deliver a put to all current subscribers."""
         with self._lock:
             for entry in self._reachable(_Subscriber, transport, sample.key):
-                entry.inbox.put(sample)
+                entry.inbox.put(sample, len(sample.payload))
 
     def request(self, transport: "MemoryTransport", key: str, payload: bytes, pending: PendingReply) -> None:
         """Give a request to one server of ``key``, or end it."""
@@ -168,7 +168,7 @@ class MemoryBroker:
                 return
             query = _Query(transport, queryable, key, payload, pending)
             self._queries.append(query)
-            if not queryable.inbox.put(query):
+            if not queryable.inbox.put(query, len(payload)):
                 self.answer(query, None)
 
     def answer(self, query: _Query, payload: bytes | None) -> None:

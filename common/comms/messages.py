@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from common.comms.budgets import HASH_PATTERN, ID_PATTERN
 from common.comms.wire import Wire
 
 F32 = npt.NDArray[np.float32]
@@ -28,18 +29,20 @@ Count = Annotated[int, Wire("1", low=0, high=2**62)]
 Sequence = Annotated[int, Wire("1", low=0, high=2**53)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
+Id = Annotated[str, Wire(text=ID_PATTERN)]  # what can stand in a key
+Hash = Annotated[str, Wire(text=HASH_PATTERN)]
 Numbers = Annotated[Mapping[str, float], Wire("by name")]
 
-RALLY_WIDTH = 11  # columns of a rally on the wire
+RALLY_WIDTH = 12  # columns of a rally on the wire
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RallyBatch:
-    """Valid launches, one a row: position 3 (m), velocity 3 (m/s), spin 3 (rad/s), drag and lift factor."""
+    """Valid launches, one a row: position 3 (m), velocity 3 (m/s), spin 3 (rad/s), drag and lift factor, kind."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
-    source: str  # id of the generator
+    source: Id  # id of the generator
     incarnation: Count
     sequence: Count  # of this source and shard: a gap is a lost batch
     shard: Count
@@ -72,15 +75,15 @@ class PolicySnapshot:
 
     VERSION: ClassVar[int] = 3
 
-    run: str
+    run: Id
     generation: Count
     version: Count
     stage_number: Count  # stage changes before this version
     stage: Stage
     epoch: Count
     frames: Count
-    contract_hash: str  # of task and network
-    training_hash: str  # of task, network and experience
+    contract_hash: Hash  # of task and network
+    training_hash: Hash  # of task, network and experience
     weights: bytes  # safetensors
     obs_mean: Annotated[F64, Wire("as the observation", "<f8", "D")]
     obs_var: Annotated[F64, Wire("its square", "<f8", "D", low=0)]
@@ -93,7 +96,7 @@ class StageChange:
 
     VERSION: ClassVar[int] = 1
 
-    run: str
+    run: Id
     generation: Count
     number: Count
     stage: Stage
@@ -139,14 +142,14 @@ class Rollout:
 
     VERSION: ClassVar[int] = 4
 
-    run: str
+    run: Id
     generation: Count
     version: Count  # of the policy that acted
     stage_number: Count
-    actor: str
+    actor: Id
     incarnation: Count
     sequence: Sequence  # from 0 without a gap
-    training_hash: str  # of the actor's task, network and experience
+    training_hash: Hash  # of the actor's task, network and experience
     obs: Annotated[F32, Wire("as the observation", "<f4", "T B D")]  # raw: the learner normalises
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
     log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log density of the action under the policy that acted
@@ -226,6 +229,9 @@ class Verdict:
     # Flow control by an absolute limit: a lost or repeated answer changes nothing.
     credit_limit: Count  # the actor may publish sequence numbers less than this ...
     credit_version: Count  # ... if this version or a later one played them
+    report_after_s: Annotated[float, Wire("s", low=0, high=3600)] = (
+        0.25  # pause of an idle actor between reports
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,8 +255,8 @@ class ActorReport:
 
     VERSION: ClassVar[int] = 1
 
-    run: str
-    actor: str
+    run: Id
+    actor: Id
     incarnation: Count
     version: Count  # of the policy that the actor holds
     published: Sequence  # sequence numbers used so far
@@ -259,6 +265,7 @@ class ActorReport:
     generation: Count  # of the learner that answered last; 0: none so far
     refused: tuple[Refusal, ...]  # by learners of other generations
     leaving: bool  # the actor sends nothing more
+    training_hash: Hash = ""  # of the actor's task, network and experience; "" fits no learner
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,8 +274,8 @@ class Status:
 
     VERSION: ClassVar[int] = 1
 
-    role: str
-    id: str
+    role: Id
+    id: Id
     incarnation: Count
     time: Annotated[float, Wire("s since 1970", low=0)]
     state: str

@@ -9,6 +9,7 @@ process) and ``zenoh_transport.py`` (processes and machines). They guarantee:
 * A request ends in exactly one outcome, by its deadline: a `Reply`, or `NoReply` with the reason.
 * After a broken link the transport repeats all declarations (subscriptions, servers, tokens). A change of
   ``reconnect_count`` means that messages may have been lost in between.
+* An answer never waits for a slow client. It may be lost instead, as a put may.
 """
 
 import time
@@ -17,13 +18,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from threading import Condition
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import Any, Final, Generic, Literal, Protocol, TypeVar
 
 from common.errors import ReportedError
 
 _Item = TypeVar("_Item")
 
 MAX_MESSAGE_BYTES = 64 * 1024 * 1024  # memory of one message at the receiver
+MAILBOX_BYTES = 256 * 1024 * 1024  # most that wait in one mailbox, besides one message
 MAX_ALIVE_EVENTS = 65536  # many more than any fleet has members: an alive event must not be dropped
 
 
@@ -114,7 +116,8 @@ class Mailbox(Generic[_Item]):
         self._bell = bell
         self._capacity = capacity
         self._keep = keep
-        self._items: deque[_Item] = deque()
+        self._items: deque[tuple[_Item, int]] = deque()
+        self._bytes = 0
         self._dropped = 0
         self._is_closed = False
 
@@ -123,31 +126,38 @@ class Mailbox(Generic[_Item]):
         """Number of items lost because the mailbox was full."""
         return self._dropped
 
-    def put(self, item: _Item) -> bool:
-        """Add ``item``; return whether the mailbox accepted it."""
+    def put(self, item: _Item, size: int = 0) -> bool:
+        """Add ``item`` of ``size`` bytes; return whether the mailbox accepted it."""
         with self._bell.lock:
             if self._is_closed:
                 return False
-            if len(self._items) >= self._capacity:
+            while self._items and (len(self._items) >= self._capacity or self._bytes + size > MAILBOX_BYTES):
                 self._dropped += 1
                 if self._keep == "oldest":
                     return False
-                self._items.popleft()
-            self._items.append(item)
+                self._pop()
+            self._items.append((item, size))
+            self._bytes += size
             self._bell.ring()
             return True
 
     def take(self) -> _Item | None:
         """Take out the oldest item; return None if there is none."""
         with self._bell.lock:
-            return self._items.popleft() if self._items else None
+            return self._pop() if self._items else None
 
     def take_all(self) -> list[_Item]:
         """Take out all items; return them, oldest first."""
         with self._bell.lock:
-            items = list(self._items)
+            items = [item for item, _ in self._items]
             self._items.clear()
+            self._bytes = 0
             return items
+
+    def _pop(self) -> _Item:
+        item, size = self._items.popleft()
+        self._bytes -= size
+        return item
 
     def close(self) -> list[_Item]:
         """Refuse all later items; return the waiting ones, oldest first."""
@@ -276,6 +286,23 @@ class PendingReply:
             return self._outcome
 
 
+@dataclass(frozen=True, slots=True)
+class Unanswered:
+    """Requests that timed out in a row on a link that seems alive."""
+
+    count: int = 0
+    since: float = 0.0  # [s] time of the first one
+
+
+STUCK_AFTER: Final = 3  # requests in a row
+STUCK_AFTER_S: Final = 20.0  # and no sooner
+
+
+def is_stuck(unanswered: Unanswered, connected: bool, now: float) -> bool:
+    """Return whether a session must be opened again: its link is up, and yet nothing comes back."""
+    return connected and unanswered.count >= STUCK_AFTER and now - unanswered.since >= STUCK_AFTER_S
+
+
 class AliveWatch:
     """Changes of the tokens of one key expression, without the tokens of the own transport."""
 
@@ -300,6 +327,14 @@ class AliveWatch:
     def wait(self, timeout_s: float) -> bool:
         """Return whether an event is waiting. Wait for one at most ``timeout_s``."""
         return self._inbox.wait(timeout_s)
+
+    def forget(self) -> None:
+        """Let all tokens end, before a new session reports those that stand. Called by the transport."""
+        for event in self._inbox.take_all():
+            if not self._is_own(event.key):
+                (self._alive.add if event.alive else self._alive.discard)(event.key)
+        for key in sorted(self._alive):
+            self._inbox.put(AliveEvent(key, alive=False))
 
     def close(self) -> None:
         """Stop watching."""

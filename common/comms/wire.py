@@ -25,6 +25,7 @@ class Wire:
         low: Least value allowed.
         high: Greatest value allowed.
         nan: Whether NaN is allowed. Infinity never is.
+        text: Pattern of a text; "": any printable one of up to `budgets.LONGEST_TEXT` characters.
     """
 
     unit: str = ""
@@ -33,6 +34,7 @@ class Wire:
     low: float = -math.inf
     high: float = math.inf
     nan: bool = False
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,15 @@ The code works around these properties of Zenoh, all of them measured:
 * Callbacks continue for a moment after a queryable is undeclared. So a server's mailbox is closed too. A request
   that is inside Zenoh at that moment is lost (6 of 9,000 sent while their server closed) and times out.
 * `close` waits for a hung hub. So it runs on a thread of its own, which may outlive the call.
+* An answer may wait 50 ms for a client that hangs. So large ones are sent by a thread of their own, at most
+  `_ANSWERS_WAITING` at a time; the hub's settings bound the wait.
+* A link may stand although nothing comes back. So a session whose requests time out in a row is opened again.
 """
 
 import json
 import logging
 import os
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -42,7 +46,9 @@ from common.comms.transport import (
     Server,
     Subscription,
     TransportError,
+    Unanswered,
     check_size,
+    is_stuck,
 )
 from common.comms.zenoh_config import ZenohConfig, session_settings
 
@@ -56,6 +62,9 @@ os.environ.setdefault(
 _OPEN_ATTEMPT_S: Final = 2.0
 _WAITING_LOG_S: Final = 10.0
 _MIB: Final = 1024 * 1024
+_LARGE_ANSWER: Final = 64 * 1024  # [bytes] from here on the thread for answers sends it
+_ANSWERS_WAITING: Final = 32  # large ones; more are refused, and their clients ask again
+_CLOSE_OLD_S: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +135,15 @@ def _reason(error: zenoh.ZError) -> str:
     return str(error).splitlines()[0].split(" at /")[0]
 
 
+@dataclass(slots=True, eq=False)
+class _Entity:
+    """A declaration, which a new session repeats."""
+
+    declare: Callable[[zenoh.Session], Any]
+    handle: Any
+    watch: AliveWatch | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class _ZenohToken:
     close: Callable[[], None]
@@ -141,13 +159,16 @@ class ZenohTransport:
         self._is_closed = False
         self._bell = Bell()
         self._publishers: dict[tuple[str, Flow], zenoh.Publisher] = {}
-        self._own_tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._own_tokens: set[str] = set()
+        self._entities: list[
+            _Entity
+        ] = []  # in order of declaration; also Zenoh undeclares what has no reference
+        self._answers: queue.SimpleQueue[tuple[zenoh.Query, bytes]] | None = None
+        self._unanswered = Unanswered()
         self._links: dict[str, bool] = {}
         self._times_up = 0
         self._link_events: Mailbox[tuple[str, bool]] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
-        session.info.declare_transport_events_listener(
-            Callback(self._record_link_event, indirect=False), history=True
-        )
+        self._declare("watch the links", self._watch_links)
 
     @property
     def connected(self) -> bool:
@@ -177,21 +198,29 @@ class ZenohTransport:
     def subscribe(self, key_expr: str, capacity: int) -> Subscription:
         """Return a subscription that holds the newest ``capacity`` samples."""
         inbox: Mailbox[zenoh.Sample] = Mailbox(self._bell, capacity, keep="newest")
-        with self._zenoh(f"subscribe to {key_expr}"):
-            subscriber = self._session.declare_subscriber(key_expr, Callback(inbox.put, indirect=False))
-        return Subscription(inbox, _read_sample, partial(self._undeclare, subscriber))
+
+        def receive(sample: zenoh.Sample) -> None:
+            inbox.put(sample, len(sample.payload))
+
+        entity = self._declare(
+            f"subscribe to {key_expr}",
+            lambda session: session.declare_subscriber(key_expr, Callback(receive, indirect=False)),
+        )
+        return Subscription(inbox, _read_sample, partial(self._undeclare, entity))
 
     def serve(self, key_expr: str, capacity: int) -> Server:
         """Return a server that holds up to ``capacity`` waiting requests."""
         inbox: Mailbox[zenoh.Query] = Mailbox(self._bell, capacity, keep="oldest")
 
         def receive(query: zenoh.Query) -> None:
-            if not inbox.put(query):
+            if not inbox.put(query, 0 if query.payload is None else len(query.payload)):
                 _answer(query, None)
 
-        with self._zenoh(f"serve {key_expr}"):
-            queryable = self._session.declare_queryable(key_expr, Callback(receive, indirect=False))
-        return Server(inbox, _read_query, partial(self._undeclare, queryable))
+        entity = self._declare(
+            f"serve {key_expr}",
+            lambda session: session.declare_queryable(key_expr, Callback(receive, indirect=False)),
+        )
+        return Server(inbox, self._read_query, partial(self._undeclare, entity))
 
     def request(self, key: str, payload: bytes, timeout_s: float, flow: Flow) -> PendingReply:
         """Send a request to one server of ``key``; return its pending reply.
@@ -205,7 +234,7 @@ class ZenohTransport:
             self._session.get(
                 key,
                 Callback(
-                    partial(_settle, pending), partial(pending.settle, NoReply.NO_SERVER), indirect=False
+                    partial(self._settle, pending), partial(pending.settle, NoReply.NO_SERVER), indirect=False
                 ),
                 target=zenoh.QueryTarget.BEST_MATCHING,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -220,10 +249,9 @@ class ZenohTransport:
 
     def declare_alive(self, key: str) -> _ZenohToken:
         """Return a token that the others see until it or this transport is closed."""
-        with self._zenoh(f"declare {key}"):
-            token = self._session.liveliness().declare_token(key)
-        self._own_tokens[key] = token  # Zenoh undeclares a token without a reference
-        return _ZenohToken(partial(self._undeclare, token))
+        entity = self._declare(f"declare {key}", lambda session: session.liveliness().declare_token(key))
+        self._own_tokens.add(key)
+        return _ZenohToken(partial(self._undeclare, entity))
 
     def watch_alive(self, key_expr: str) -> AliveWatch:
         """Return a watch on tokens. Its first events are the tokens that exist already."""
@@ -232,14 +260,22 @@ class ZenohTransport:
         def receive(sample: zenoh.Sample) -> None:
             inbox.put(AliveEvent(key=str(sample.key_expr), alive=sample.kind == zenoh.SampleKind.PUT))
 
-        with self._zenoh(f"watch {key_expr}"):
-            watcher = self._session.liveliness().declare_subscriber(
+        entity = self._declare(
+            f"watch {key_expr}",
+            lambda session: session.liveliness().declare_subscriber(
                 key_expr, Callback(receive, indirect=False), history=True
-            )
-        return AliveWatch(inbox, self._own_tokens.__contains__, partial(self._undeclare, watcher))
+            ),
+        )
+        entity.watch = AliveWatch(inbox, self._own_tokens.__contains__, lambda: self._undeclare(entity))
+        return entity.watch
 
     def wait(self, timeout_s: float) -> bool:
-        """Return whether anything arrived since the last call. Wait for it at most ``timeout_s``."""
+        """Return whether anything arrived since the last call. Wait for it at most ``timeout_s``.
+
+        A client whose requests time out in a row although its link is up opens its session again here.
+        """
+        if self._config.mode == "client" and is_stuck(self._unanswered, self.connected, time.monotonic()):
+            self._reopen()
         return self._bell.wait(timeout_s)
 
     def close(self, timeout_s: float = 5.0) -> bool:
@@ -266,10 +302,75 @@ class ZenohTransport:
             )
         return self._publishers[key, flow]
 
-    def _undeclare(self, entity: Any) -> None:
-        if not self._is_closed:
+    def _declare(self, action: str, declare: Callable[[zenoh.Session], Any]) -> _Entity:
+        with self._zenoh(action):
+            entity = _Entity(declare, declare(self._session))
+        self._entities.append(entity)
+        return entity
+
+    def _undeclare(self, entity: _Entity) -> None:
+        if not self._is_closed and entity in self._entities:
+            self._entities.remove(entity)
             with self._zenoh("undeclare"):
-                entity.undeclare()
+                entity.handle.undeclare()
+
+    def _reopen(self) -> None:
+        """Replace the session by a new one with the same declarations; keep it if the hub does not answer."""
+        unanswered, self._unanswered = self._unanswered, Unanswered()
+        log.warning(
+            "requests without answer count=%d on a live link endpoint=%s; opening the session again",
+            unanswered.count,
+            self._config.endpoint,
+        )
+        try:
+            fresh = zenoh.open(_zenoh_config(self._config, _OPEN_ATTEMPT_S))
+        except zenoh.ZError as error:
+            log.warning("hub does not answer endpoint=%s reason=%s", self._config.endpoint, _reason(error))
+            return
+        closer = threading.Thread(target=self._session.close, name="zenoh-close", daemon=True)
+        closer.start()  # its tokens end before the new ones are declared
+        closer.join(_CLOSE_OLD_S)
+        self._session = fresh
+        self._publishers.clear()
+        self._update_links()
+        self._links.clear()
+        for entity in self._entities:
+            if entity.watch is not None:
+                entity.watch.forget()
+            entity.handle = entity.declare(fresh)
+
+    def _read_query(self, query: zenoh.Query) -> Request:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        return Request(str(query.key_expr), payload, partial(self._reply, query))
+
+    def _reply(self, query: zenoh.Query, payload: bytes | None) -> None:
+        if payload is None or len(payload) < _LARGE_ANSWER:
+            _answer(query, payload)
+            return
+        if self._answers is None:
+            self._answers = queue.SimpleQueue()
+            work = partial(_send_answers, self._answers)
+            threading.Thread(target=work, name="answers", daemon=True).start()
+        if self._answers.qsize() >= _ANSWERS_WAITING:
+            _answer(query, None)
+        else:
+            self._answers.put((query, payload))
+
+    def _settle(self, pending: PendingReply, reply: zenoh.Reply) -> None:
+        # All error replies are Zenoh's own: its time-out.
+        if reply.ok is None:
+            pending.settle(NoReply.TIMEOUT)
+            before = self._unanswered
+            self._unanswered = Unanswered(
+                before.count + 1, before.since if before.count else time.monotonic()
+            )
+        else:
+            pending.settle(Reply(reply.ok.payload.to_bytes()))
+            self._unanswered = Unanswered()
+
+    def _watch_links(self, session: zenoh.Session) -> Any:
+        listener = Callback(self._record_link_event, indirect=False)
+        return session.info.declare_transport_events_listener(listener, history=True)
 
     @contextmanager
     def _zenoh(self, action: str) -> Iterator[None]:
@@ -299,9 +400,10 @@ def _read_sample(sample: zenoh.Sample) -> Sample:
     return Sample(key=str(sample.key_expr), payload=sample.payload.to_bytes())
 
 
-def _read_query(query: zenoh.Query) -> Request:
-    payload = b"" if query.payload is None else query.payload.to_bytes()
-    return Request(str(query.key_expr), payload, partial(_answer, query))
+def _send_answers(answers: "queue.SimpleQueue[tuple[zenoh.Query, bytes]]") -> None:
+    """Send large answers one after the other, as long as the process lives."""
+    while True:
+        _answer(*answers.get())
 
 
 def _answer(query: zenoh.Query, payload: bytes | None) -> None:
@@ -312,8 +414,3 @@ def _answer(query: zenoh.Query, payload: bytes | None) -> None:
         log.debug("reply not sent, the client has left key=%s reason=%s", query.key_expr, _reason(error))
     finally:
         query.drop()  # type: ignore[no-untyped-call]  # ends the query; without it the client waits for its time-out
-
-
-def _settle(pending: PendingReply, reply: zenoh.Reply) -> None:
-    # All error replies are Zenoh's own: its time-out.
-    pending.settle(NoReply.TIMEOUT if reply.ok is None else Reply(reply.ok.payload.to_bytes()))

@@ -30,6 +30,7 @@ from pydantic_settings import BaseSettings, InitSettingsSource, PydanticBaseSett
 
 from common.errors import ReportedError
 from common.service.config_help import Setting, format_help, settings_of
+from common.service.whole_file import write_whole
 
 ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
 TABLES: Final = (
@@ -195,11 +196,9 @@ def save_settings(file: Path, tables: Mapping[str, Any]) -> None:
         ConfigError: The file is not TOML.
     """
     before = read_toml(file) if file.exists() else {}
-    part = file.with_name(f"{file.name}.part")
     merged = {**before, **tables}
     ordered = dict(sorted(merged.items(), key=lambda item: isinstance(item[1], dict)))  # TOML: tables last
-    part.write_text(tomli_w.dumps(ordered), encoding="utf-8")
-    os.replace(part, file)  # services that are just starting read it
+    write_whole(file, tomli_w.dumps(ordered))  # services that are just starting read it
 
 
 def read_toml(file: Path) -> dict[str, Any]:

@@ -8,8 +8,10 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
+from common.comms.budgets import one_line
 from common.comms.codec import DecodeError, decode_one_of, encode
 from common.comms.keys import Keys
 from common.comms.messages import ActorReport, Command, Control, ControlReply, Status, Verdict
@@ -20,6 +22,7 @@ from common.service.settings import ServiceConfig
 log = logging.getLogger(__name__)
 
 LEARNER_ID: Final = "0"  # a run has one learner
+REFUSALS_LOGGED: Final = 20  # lines a minute for each kind of refused message; all are counted
 CONTROL_MAILBOX: Final = 256  # requests that wait; more than all actors of a run send at once
 
 
@@ -29,6 +32,29 @@ class Drops(Protocol):
     @property
     def dropped(self) -> int:
         """Messages that a full mailbox dropped."""
+
+
+@dataclass(slots=True)
+class RefusalLog:
+    """Which reasons of one kind of refused message have been logged in the last minute.
+
+    A peer that sends many bad messages must not fill the log.
+    """
+
+    since: float = -math.inf  # [s] start of the minute
+    logged: set[str] = field(default_factory=set)
+
+    def line(self, reason: str, now: float) -> str:
+        """Return what to log about a refusal, or ""."""
+        if now - self.since >= 60.0:
+            self.since = now
+            self.logged.clear()
+        if reason in self.logged or len(self.logged) >= REFUSALS_LOGGED:
+            return ""
+        self.logged.add(reason)
+        if len(self.logged) == REFUSALS_LOGGED:
+            return f"{reason}; further ones in this minute are only counted"
+        return reason
 
 
 class Member:
@@ -62,6 +88,9 @@ class Member:
         self._control = transport.serve(self.keys.ctl(role, self.id), capacity=CONTROL_MAILBOX)
         self._mailboxes: dict[str, tuple[Drops, ...]] = {"control": (self._control,)}
         self._token: AliveToken | None = None
+        self._refusals: dict[str, RefusalLog] = {}
+        self._link_lost: float | None = None  # [s]
+        self._endpoint = config.endpoint
 
     def join(self) -> None:
         """Declare the liveliness token: the service can answer now."""
@@ -79,7 +108,9 @@ class Member:
             report: Answers an actor's report; None where actors do not report to this service.
         """
         allowed = (Control,) if report is None else (ActorReport, Control)
-        while (request := self._control.poll()) is not None:
+        for _ in range(CONTROL_MAILBOX):
+            if (request := self._control.poll()) is None:
+                break
             try:
                 message = decode_one_of(request.payload, allowed)
             except DecodeError as error:
@@ -94,9 +125,25 @@ class Member:
             request.reply(encode(ControlReply(True, self.state, "")))
 
     def refuse(self, kind: str, reason: object) -> None:
-        """Count and log a message that can't be used."""
+        """Count a message that can't be used, and log the reason unless it was logged in the last minute."""
         self._metrics.inc("topspin_messages_refused_total", 1.0, kind=kind)
-        log.warning("message refused kind=%s reason=%s", kind, reason)
+        text = one_line(str(reason))
+        line = self._refusals.setdefault(kind, RefusalLog()).line(text, time.monotonic())
+        if line:
+            log.warning("message refused kind=%s reason=%s", kind, line)
+
+    def note_link(self, now: float) -> None:
+        """Log when the link to the hub is lost, and when it is back."""
+        if self._transport.connected == (self._link_lost is None):
+            return
+        if self._link_lost is None:
+            self._link_lost = now
+            log.warning("link to the hub lost endpoint=%s", self._endpoint)
+        else:
+            log.info(
+                "link to the hub is back endpoint=%s after_s=%.1f", self._endpoint, now - self._link_lost
+            )
+            self._link_lost = None
 
     def is_due(self, now: float) -> bool:
         """Return whether a heartbeat is due at ``now`` [s], and count it as sent if so."""

@@ -172,6 +172,9 @@ METRICS: Final = _table(
         (_L,),
         ("fate",),
     ),
+    Metric(
+        "topspin_misfit_actors", "gauge", "services", "Live actors whose contract is not the learner's", (_L,)
+    ),
     Metric("topspin_queue_depth", "gauge", "rollouts", "Rollouts that wait for an update", (_L,)),
     # the update
     Metric("topspin_learning_rate", "gauge", "1", "Learning rate of Adam", (_L,)),

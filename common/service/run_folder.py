@@ -68,6 +68,11 @@ class RunFolder:
         return self.root / "tb"
 
     @property
+    def generation(self) -> Path:
+        """How many learners the run has had, as a number."""
+        return self.root / ".generation"
+
+    @property
     def checkpoints(self) -> Path:
         """Checkpoints, from which --resume continues."""
         return self.root / "checkpoints"

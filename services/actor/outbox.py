@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from common.comms.budgets import LISTED_REFUSALS
 from common.comms.messages import FINAL_VERDICTS, ActorReport, Refusal, Verdict, VerdictKind
 
 
@@ -99,7 +100,7 @@ def idle_reason(outbox: Outbox, generation: int, version: int) -> str:
     if len(outbox.flights) >= outbox.config.window:
         return f"the learner's verdict on rollout {outbox.flights[0].sequence}"
     if outbox.generation != generation:
-        return "the learner's first answer" if outbox.generation < generation else "the new learner's policy"
+        return "the learner's first answer" if outbox.generation == 0 else "policy and credits of one learner"
     if version < outbox.credit_version:
         return f"policy version {outbox.credit_version}"
     if outbox.next_sequence >= outbox.credit_limit:
@@ -151,14 +152,11 @@ def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Out
 
 
 def credited(outbox: Outbox, verdict: Verdict) -> Outbox:
-    """Return the outbox with the credits that came with any verdict; those of an earlier learner are ignored."""
-    if verdict.generation < outbox.generation:
-        return outbox
-    if verdict.generation > outbox.generation:
-        limit, version = verdict.credit_limit, verdict.credit_version
-    else:
-        limit = max(outbox.credit_limit, verdict.credit_limit)
-        version = max(outbox.credit_version, verdict.credit_version)
+    """Return the outbox with the credits that came with a verdict of the followed learner."""
+    limit, version = verdict.credit_limit, verdict.credit_version
+    if verdict.generation == outbox.generation:
+        limit = max(outbox.credit_limit, limit)
+        version = max(outbox.credit_version, version)
     return replace(outbox, generation=verdict.generation, credit_limit=limit, credit_version=version)
 
 
@@ -174,7 +172,14 @@ def expired(outbox: Outbox, now: float) -> Outbox:
 
 
 def report(
-    outbox: Outbox, *, run: str, actor: str, incarnation: int, version: int, leaving: bool = False
+    outbox: Outbox,
+    *,
+    run: str,
+    actor: str,
+    incarnation: int,
+    version: int,
+    training_hash: str,
+    leaving: bool = False,
 ) -> ActorReport:
     """Return what the learner needs to balance its ledger."""
     return ActorReport(
@@ -184,10 +189,11 @@ def report(
         version=version,
         published=outbox.next_sequence,
         in_flight=tuple(flight.sequence for flight in outbox.flights),
-        dropped=outbox.dropped,
+        dropped=outbox.dropped[-LISTED_REFUSALS:],
         generation=outbox.generation,
-        refused=tuple(refusal for refusal in outbox.refused if refusal.generation != outbox.generation),
+        refused=tuple(r for r in outbox.refused if r.generation != outbox.generation)[-LISTED_REFUSALS:],
         leaving=leaving,
+        training_hash=training_hash,
     )
 
 

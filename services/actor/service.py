@@ -10,6 +10,7 @@ from common.comms.messages import (
     PolicySnapshot,
     StageChange,
     Verdict,
+    VerdictKind,
 )
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.policy.contract import PolicyError
@@ -18,6 +19,7 @@ from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
 from services.actor.config import ActorConfig
+from services.actor.following import Following, adopted, noted, objection
 from services.actor.player import Player
 from services.actor.rally_buffer import RallyBuffer
 from services.actor.rally_feed import RallyFeed, StopRequested
@@ -25,7 +27,9 @@ from services.actor.rally_feed import RallyFeed, StopRequested
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.05
-REPORT_INTERVAL_S = 0.25  # while without credits: a lost grant is repeated after this time
+REPORT_INTERVAL_S = (
+    0.25  # while without credits, until the learner sets another: a lost grant is repeated then
+)
 ASK_AGAIN_S = 1.0  # pause between requests for the policy
 LAST_VERDICTS_S = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S = 2.0
@@ -51,22 +55,36 @@ class ActorService:
         envs = config.env_count
         self._buffer = RallyBuffer(envs, config.task, seed, self._refill)
         self._player = Player(
-            config.task, config.experience, config.network, self._buffer, envs, config.horizon, seed
+            config.task,
+            config.experience,
+            config.network,
+            self._buffer,
+            envs,
+            config.horizon,
+            seed,
+            note=self._buffer.note,
         )
         self._outbox = box.Outbox(config.outbox)
         self._pending: dict[int, PendingReply] = {}
         self._report: PendingReply | None = None
         self._asked: PendingReply | None = None
         self._next_ask = self._next_report = 0.0
+        self._report_after_s = REPORT_INTERVAL_S
+        self._reported = (0, 0)  # generation and version of the policy in the last report
+        self._following = Following()
+        self._is_doubted = False  # whether the policy is not the learner's, though it has its generation
+        self._misfit = ""  # why the learner's policy, or this actor's contract, is refused
         self._may_have_missed = False  # a policy may be missed while the link is down or the mailbox is full
         self._policies = transport.subscribe(keys.policy(), capacity=1)
         self._stages = transport.subscribe(keys.stage(), capacity=64)
         self._member.watch("stage", self._stages)
+        self._learners = transport.watch_alive(keys.every_alive_of("learner"))
         self._ready: float | None = None  # [s] time of the first policy
         self._reconnects = transport.reconnect_count
         self._frames = 0
         self._idle_since: float | None = None
         self._warned = False
+        self._waits_for = ""
         self._member.join()
 
     @property
@@ -92,6 +110,8 @@ class ActorService:
     def step(self, now: float) -> float:
         """Do what is due, play one rollout if the learner needs one, and return how long to wait [s]."""
         self._member.answer_control()
+        self._member.note_link(now)
+        self._note_learners()
         self._take_policies(now)
         self._take_verdicts(now)
         self._outbox = box.expired(self._outbox, now)
@@ -129,6 +149,7 @@ class ActorService:
             self._send(now)
             self._transport.wait(IDLE_WAIT_S)
             now = time.monotonic()
+            self._note_learners()
             self._take_verdicts(now)
         pending = self._send_report(leaving=True, timeout_s=LAST_REPORT_S)
         if pending.wait() is NoReply.TIMEOUT:
@@ -142,8 +163,12 @@ class ActorService:
         snapshot = self._player.snapshot
         if self._member.is_draining:
             return "the last verdicts"
+        if not self._transport.connected:
+            return f"the link to the hub at {self._config.endpoint}"
+        if not self._following.standing:
+            return f"a learner: run {self._config.run!r} has none at the hub"
         if snapshot is None:
-            return f"a policy from the learner on {self._keys.policy()}"
+            return self._misfit or f"a policy from the learner on {self._keys.policy()}"
         self._ready = now if self._ready is None else self._ready
         is_patient = self._feed.asks or now - self._ready < self._config.rally_wait_s
         if (
@@ -152,7 +177,8 @@ class ActorService:
             self._refill()
             if self._buffer.room > 0:
                 return f"rallies of shard {self._feed.shard} from a generator"
-        return box.idle_reason(self._outbox, snapshot.generation, snapshot.version)
+        reason = box.idle_reason(self._outbox, snapshot.generation, snapshot.version)
+        return (self._misfit or reason) if reason else ""
 
     def _play(self, now: float) -> None:
         rollout = self._player.play(self._config.id, self._member.incarnation, self._outbox.next_sequence)
@@ -177,15 +203,33 @@ class ActorService:
         self._member.state = "draining" if self._member.is_draining else "waiting"
         if self._idle_since is None:
             self._idle_since, self._warned = now, False
+        if reason != self._waits_for:
+            self._waits_for, self._warned = reason, False
         if not self._warned and now - self._idle_since > self._config.silence_warning_s:
             self._warned = True
             log.warning("waiting for=%r seconds=%.0f", reason, now - self._idle_since)
         outcome = self._report.poll() if self._report else NoReply.TIMEOUT
         if outcome is not None and now >= self._next_report:
-            self._next_report = now + REPORT_INTERVAL_S
+            self._next_report = now + self._report_after_s
             self._report = self._send_report(leaving=False, timeout_s=5.0)
 
     # ---- policies
+
+    def _note_learners(self) -> None:
+        """Record which learners live."""
+        for event in self._learners.poll():
+            try:
+                generation = self._keys.member(event.key).incarnation
+            except ValueError as error:  # KeyPartError, or digits that are no number
+                self._member.refuse("alive", error)
+                continue
+            self._following = noted(self._following, generation, event.alive)
+            if event.alive:
+                log.info("learner found generation=%d", generation)
+                self._may_have_missed = True
+                self._next_report = 0.0
+            else:
+                log.warning("learner gone generation=%d", generation)
 
     def _take_policies(self, now: float) -> None:
         for sample in self._policies.poll():
@@ -205,32 +249,51 @@ class ActorService:
             self._asked = None
             if isinstance(outcome, Reply):
                 self._may_have_missed = False
-                self._adopt(outcome.payload)
+                self._adopt(outcome.payload, is_answer=True)
         if self._asked is None and now >= self._next_ask and self._is_behind():
             self._next_ask = now + ASK_AGAIN_S
             self._asked = self._transport.request(self._keys.policy(), b"", 5.0, Flow.POLICY)
 
     def _is_behind(self) -> bool:
-        """Return whether the learner is known to have a newer policy."""
+        """Return whether the learner is known to have another policy."""
         snapshot = self._player.snapshot
-        if snapshot is None:
+        if snapshot is None or self._may_have_missed or self._is_doubted:
             return True
-        newest = (self._outbox.generation, self._outbox.credit_version)
-        return (snapshot.generation, snapshot.version) < newest or self._may_have_missed
+        if self._outbox.generation not in (0, snapshot.generation):
+            return True
+        return self._outbox.generation != 0 and snapshot.version < self._outbox.credit_version
 
-    def _adopt(self, payload: bytes) -> None:
+    def _adopt(self, payload: bytes, is_answer: bool = False) -> None:
+        """Play the policy in a message if it is a newer one of the followed learner.
+
+        Args:
+            payload: The message.
+            is_answer: Whether the learner answered with it. Then it may also replace one that is doubted.
+        """
+        mine = self._player.snapshot
         try:
             snapshot = decode(payload, PolicySnapshot)
-            mine = self._player.snapshot
-            if mine and (snapshot.generation, snapshot.version) <= (mine.generation, mine.version):
+            may_go_back = is_answer and self._is_doubted
+            if (
+                mine is not None
+                and snapshot.generation == mine.generation
+                and snapshot.version <= mine.version
+                and not may_go_back
+            ):
+                return
+            if fault := objection(self._following, snapshot.generation):
+                self._member.refuse("policy", fault)
                 return
             self._player.adopt(snapshot)
         except (DecodeError, PolicyError) as error:
             self._member.refuse("policy", error)
+            if isinstance(error, PolicyError) and mine is None:
+                self._misfit = f"a policy that it can play: {error}"
             return
-        self._next_report = (
-            0.0  # the learner needs new rollouts of a new version: report at once to get credits
-        )
+        self._misfit, self._is_doubted = "", False
+        self._following = adopted(self._following, snapshot.generation)
+        # The learner needs new rollouts of a new version: report at once to get credits
+        self._next_report = 0.0
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.set("topspin_stage", snapshot.stage)
         if (
@@ -275,12 +338,31 @@ class ActorService:
             verdict = self._verdict(outcome)
             if verdict is not None:
                 self._outbox = box.credited(self._outbox, verdict)
+                self._heed(verdict)
+
+    def _heed(self, verdict: Verdict) -> None:
+        """Take what the answer to a report says about this actor."""
+        self._report_after_s = verdict.report_after_s
+        generation, version = self._reported
+        if verdict.generation == generation and verdict.version < version and not self._is_doubted:
+            self._is_doubted = True
+            log.warning(
+                "policy version=%d is not from the learner, whose newest is %d; asking the learner for it",
+                version,
+                verdict.version,
+            )
+        is_misfit = verdict.kind in (VerdictKind.WRONG_CONTRACT, VerdictKind.WRONG_RUN)
+        self._misfit = f"a learner of its own contract: {verdict.reason}" if is_misfit else ""
 
     def _verdict(self, outcome: Reply | NoReply) -> Verdict | None:
         if isinstance(outcome, NoReply):
             return None
         try:
-            return decode(outcome.payload, Verdict)
+            verdict = decode(outcome.payload, Verdict)
+            if fault := objection(self._following, verdict.generation):
+                self._member.refuse("verdict", fault)
+                return None
+            return verdict
         except DecodeError as error:
             self._member.refuse("verdict", error)
             return None
@@ -301,8 +383,10 @@ class ActorService:
             actor=self._config.id,
             incarnation=self._member.incarnation,
             version=snapshot.version if snapshot else 0,
+            training_hash=self._player.training_hash,
             leaving=leaving,
         )
+        self._reported = (snapshot.generation, snapshot.version) if snapshot else (0, 0)
         return self._transport.request(
             self._keys.ctl("learner", LEARNER_ID), encode(report), timeout_s, Flow.CONTROL
         )

@@ -94,6 +94,7 @@ class EvaluatorService:
         """Request the policy when it is due, and evaluate it when it has arrived."""
         self._member.answer_control()
         now = self._clock()
+        self._member.note_link(now)
         if self._asked is None and now >= self._next_play:
             # Usually the running mean of the weights: no actor plays it, so it is requested and not broadcast.
             self._asked = self._transport.request(self._member.keys.policy(), AVERAGE, ANSWER_S, Flow.POLICY)

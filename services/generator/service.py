@@ -53,6 +53,7 @@ class GeneratorService:
     def step(self, now: float) -> float:
         """Answer, publish what is due, and return how long to wait [s]."""
         self._answer()
+        self._member.note_link(now)
         wait = IDLE_WAIT_S
         self._member.state = "idle"
         for shard in self._shards:

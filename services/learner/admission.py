@@ -60,7 +60,8 @@ class Case:
     max_lag: int
 
 
-def _differs(what: str, got: object, wanted: object) -> str:
+def differs(what: str, got: object, wanted: object) -> str:
+    """Return that two values differ, or ""."""
     return "" if got == wanted else f"{what} {got}; allowed: {wanted}"
 
 
@@ -78,20 +79,20 @@ def _too_old(case: Case) -> str:
 
 # Each rule returns why it applies, or "".
 RULES: Final[tuple[tuple[VerdictKind, Callable[[Case], str]], ...]] = (
-    (VerdictKind.WRONG_RUN, lambda case: _differs("run", case.header.run, case.learner.run)),
+    (VerdictKind.WRONG_RUN, lambda case: differs("run", case.header.run, case.learner.run)),
     (VerdictKind.DUPLICATE, lambda case: "this number has a verdict already" if case.is_known else ""),
     (VerdictKind.INVALID, lambda case: case.header.fault or _ahead(case)),
     (
         VerdictKind.WRONG_GENERATION,
-        lambda case: _differs("generation", case.header.generation, case.learner.generation),
+        lambda case: differs("generation", case.header.generation, case.learner.generation),
     ),
     (
         VerdictKind.WRONG_CONTRACT,
-        lambda case: _differs("training", case.header.training_hash, case.learner.training_hash),
+        lambda case: differs("training", case.header.training_hash, case.learner.training_hash),
     ),
     (
         VerdictKind.STALE_STAGE,
-        lambda case: _differs("stage number", case.header.stage_number, case.learner.stage_number),
+        lambda case: differs("stage number", case.header.stage_number, case.learner.stage_number),
     ),
     (VerdictKind.TOO_OLD, _too_old),
     (

@@ -16,6 +16,7 @@ from services.learner.training import EvaluatedWeights, Training
 log = logging.getLogger(__name__)
 
 MAILBOX: Final = 256  # requests that wait
+ANSWERED_AT_ONCE: Final = 16  # requests answered between two gradient steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +87,14 @@ class Broadcast:
         self._transport.publish(self._keys.stage(), encode(self.stages[-1]), Flow.STAGE)
 
     def answer(self) -> None:
-        """Answer the requests that wait."""
-        while (request := self._policies.poll()) is not None:
+        """Answer the requests that wait, a bounded number at a time."""
+        for _ in range(ANSWERED_AT_ONCE):
+            if (request := self._policies.poll()) is None:
+                break
             request.reply(self._averaged() if request.payload == AVERAGE else self._blob)
-        while (request := self._stage_log.poll()) is not None:
+        for _ in range(ANSWERED_AT_ONCE):
+            if (request := self._stage_log.poll()) is None:
+                break
             request.reply(encode(StageLog(tuple(self.stages))))
 
     def _averaged(self) -> bytes:

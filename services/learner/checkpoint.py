@@ -1,12 +1,16 @@
 """Checkpoints: one safetensors file with everything a resumed run needs, replaced in one step.
 
-Tensors: network, Adam's moments, observation and value moments, the shuffle's random state. The rest, `Progress` and
-what the service adds (stage log, ledger), is JSON in the file's metadata.
+Tensors: network, Adam's moments, observation and value moments, the shuffle's random state, and the rollouts that
+wait at a planned stop. The rest, `Progress` and what the service adds (stage log, ledger), is JSON in the file's
+metadata. Every tensor and the JSON have a checksum, so a damaged file is told from one of other settings.
 """
 
 import json
+import logging
 import os
-from dataclasses import asdict, dataclass
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +24,29 @@ from common.errors import ReportedError
 from common.policy.contract import PolicyError
 from common.policy.normalizer import Moments
 from common.policy.weights import load_state, state_tensors
+from common.service.whole_file import sync_folder
 from services.learner.divergence import Health
 from services.learner.epoch_stats import Progress
 from services.learner.training import Training
 
-FORMAT = 2
+log = logging.getLogger(__name__)
+
+FORMAT = 3
+WITHOUT_CHECKSUMS = 2  # a format that is read too
 SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
 GOOD = "good"  # subfolder with the last good checkpoint, for a run that diverges
 
-_NETWORK, _AVERAGE, _ADAM = "network.", "average.", "adam."
+_NETWORK, _AVERAGE, _ADAM, _QUEUE = "network.", "average.", "adam.", "queue."
 _MOMENTS = ("obs_moments", "value_moments")
 
 
 class CheckpointError(ReportedError, ValueError):
     """A checkpoint that can't be resumed from: one line with the file and the fault."""
+
+
+class DamagedCheckpointError(CheckpointError):
+    """A checkpoint whose bytes are not those that were written; an older one may be whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +58,8 @@ class Extras:
     stage_log: list[dict[str, Any]]
     accounts: list[dict[str, Any]]  # the fate of every rollout: ledger.AccountSnapshot
     trained_seconds: float  # since the first trained batch, through restarts
+    closed: tuple[tuple[str, int], ...] = ()  # lives of actors whose accounts are closed
+    queue: tuple[bytes, ...] = ()  # encoded rollouts that wait for an update, at a planned stop
 
 
 def save(folder: Path, training: Training, extras: Extras) -> Path:
@@ -64,14 +78,25 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
         tensors[f"{which}.mean"], tensors[f"{which}.var"] = np.array(moments.mean), np.array(moments.var)
         tensors[f"{which}.count"] = np.array(moments.count, np.int64)
     tensors["shuffle"] = training.generator.get_state().numpy().copy()
-    about = {"format": FORMAT, "progress": asdict(training.progress), "extras": asdict(extras)}
+    for index, rollout in enumerate(extras.queue):
+        tensors[f"{_QUEUE}{index:06d}"] = np.frombuffer(rollout, np.uint8)
+    kept = asdict(extras)
+    del kept["queue"]
+    about = {
+        "format": FORMAT,
+        "progress": asdict(training.progress),
+        "extras": kept,
+        "checksums": {name: _checksum(value) for name, value in tensors.items()},
+    }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{training.progress.version:08d}{SUFFIX}"
     part = path.with_suffix(".part")
-    save_file(tensors, part, metadata={"topspin": json.dumps(about)})
+    text = json.dumps(about)
+    save_file(tensors, part, metadata={"topspin": text, "checksum": str(zlib.crc32(text.encode()))})
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
+    sync_folder(folder)
     for stale in folder.glob("*.part"):  # of a process that ended within a save
         stale.unlink(missing_ok=True)
     for old in checkpoints(folder)[:-KEPT]:
@@ -106,18 +131,10 @@ def restore(path: Path, training: Training) -> Extras:
     """Load a checkpoint into ``training`` and return the service's extras.
 
     Raises:
-        CheckpointError: The file is missing, damaged, or of another network; ``training`` may be half changed.
+        DamagedCheckpointError: The file is missing or damaged; ``training`` is unchanged.
+        CheckpointError: It is of another network; ``training`` may be half changed.
     """
-    try:
-        with safe_open(path, framework="numpy") as file:
-            about = json.loads((file.metadata() or {})["topspin"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except FileNotFoundError:
-        raise CheckpointError(f"no checkpoint {path}") from None
-    except (SafetensorError, OSError, ValueError, KeyError) as error:
-        raise CheckpointError(f"checkpoint {path} is not readable: {error}") from None
-    if about.get("format") != FORMAT:
-        raise CheckpointError(f"checkpoint {path} has format {about.get('format')!r}; allowed is {FORMAT}")
+    about, tensors = _read(path)
     try:
         load_state(training.network, _under(_NETWORK, tensors))
         load_state(training.average, _under(_AVERAGE, tensors))
@@ -128,9 +145,60 @@ def restore(path: Path, training: Training) -> Extras:
         training.generator.set_state(torch.from_numpy(np.array(tensors["shuffle"])))
         progress = about["progress"]
         training.progress = Progress(**progress | {"health": Health(**progress["health"])})
-        return Extras(**about["extras"])
+        queue = tuple(tensors[name].tobytes() for name in sorted(tensors) if name.startswith(_QUEUE))
+        extras = Extras(**about["extras"], queue=queue)
+        return replace(extras, closed=tuple((actor, life) for actor, life in extras.closed))
     except (PolicyError, KeyError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"checkpoint {path} doesn't fit this configuration: {error}") from None
+
+
+def restore_newest(folder: Path, training: Training) -> tuple[Path, Extras]:
+    """Load a run's newest whole checkpoint into ``training``; return it with the service's extras.
+
+    Raises:
+        CheckpointError: There is none, all are damaged, or the newest whole one is of another network.
+    """
+    newest(folder)
+    faults: list[str] = []
+    for path in reversed(checkpoints(folder)):
+        try:
+            extras = restore(path, training)
+        except DamagedCheckpointError as error:
+            faults.append(str(error))
+            continue
+        for fault in faults:
+            log.warning("%s; going on from file=%s, the newest whole one", fault, path)
+        return path, extras
+    raise CheckpointError(f"nothing to resume in {folder}: no whole checkpoint there; {'; '.join(faults)}")
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Return the JSON and the tensors of a checkpoint that are as they were written."""
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata: Mapping[str, str] = file.metadata() or {}
+            about = json.loads(metadata["topspin"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            found = about["format"]
+    except FileNotFoundError:
+        raise DamagedCheckpointError(f"no checkpoint {path}") from None
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedCheckpointError(f"checkpoint {path} is not readable: {error}") from None
+    if found == WITHOUT_CHECKSUMS:
+        return about, tensors
+    if found != FORMAT:
+        raise CheckpointError(f"checkpoint {path} has format {found!r}; allowed is {FORMAT}")
+    if metadata.get("checksum") != str(zlib.crc32(metadata["topspin"].encode())):
+        raise DamagedCheckpointError(f"checkpoint {path} is damaged: checksum of its description")
+    checksums = about["checksums"]
+    for name in sorted(checksums.keys() | tensors.keys()):
+        if name not in tensors or checksums.get(name) != _checksum(tensors[name]):
+            raise DamagedCheckpointError(f"checkpoint {path} is damaged: checksum of {name}")
+    return about, tensors
+
+
+def _checksum(value: npt.NDArray[Any]) -> int:
+    return zlib.crc32(np.ascontiguousarray(value).tobytes())
 
 
 def _under(prefix: str, tensors: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

@@ -52,13 +52,23 @@ class Ledger:
 
     def __add__(self, other: "Ledger") -> "Ledger":
         """Return the account of both together."""
+        return self._joined(other, 1)
+
+    def __sub__(self, other: "Ledger") -> "Ledger":
+        """Return the account without ``other``, which is a part of it."""
+        return self._joined(other, -1)
+
+    def _joined(self, other: "Ledger", sign: int) -> "Ledger":
+        refused = Counter(self.refused)
+        for kind, count in other.refused.items():
+            refused[kind] += sign * count
         return Ledger(
-            published=self.published + other.published,
-            trained=self.trained + other.trained,
-            refused=MappingProxyType(Counter(self.refused) + Counter(other.refused)),
-            dropped=self.dropped + other.dropped,
-            in_flight=self.in_flight + other.in_flight,
-            lost=self.lost + other.lost,
+            published=self.published + sign * other.published,
+            trained=self.trained + sign * other.trained,
+            refused=MappingProxyType({kind: count for kind, count in refused.items() if count}),
+            dropped=self.dropped + sign * other.dropped,
+            in_flight=self.in_flight + sign * other.in_flight,
+            lost=self.lost + sign * other.lost,
         )
 
 
@@ -98,13 +108,32 @@ class Account:
     def __init__(self, actor: str, incarnation: int) -> None:
         self.actor = actor
         self.incarnation = incarnation
-        self.is_alive = True  # a dead actor's missing rollouts will not arrive
         self.is_out_of_sight = False  # its liveliness token is gone: its reports are older than that
-        self.last_heard = 0.0  # [s] on the caller's clock
+        self.training_hash = ""  # of its last message
+        self.last_progress = 0.0  # [s] time of its last grant or new rollout, on the caller's clock
+        self.refused_in_a_row = 0
+        self.no_credits_before = 0.0  # [s] end of its pause after refusals
         self.credit_limit = 0
+        self.changes = 0  # of what its ledger counts
+        self._is_alive = True
         self._known: list[tuple[int, int, Outcome]] = []  # half-open ranges in order, merged where they meet
         self._counts: Counter[Outcome] = Counter()
         self._published = 0
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether missing rollouts may arrive. Those of a dead actor will not."""
+        return self._is_alive
+
+    @is_alive.setter
+    def is_alive(self, value: bool) -> None:
+        self.changes += value != self._is_alive
+        self._is_alive = value
+
+    @property
+    def queued(self) -> int:
+        """How many rollouts wait for an update, or are in it."""
+        return self._counts[Fate.QUEUED]
 
     @property
     def published(self) -> int:
@@ -138,7 +167,9 @@ class Account:
 
     def hear(self, report: ActorReport, generation: int) -> None:
         """Record the outcomes that the actor knows and the learner of ``generation`` may not."""
-        self._published = max(self._published, report.published)
+        if report.published > self._published:
+            self.changes += 1
+            self._published = report.published
         elsewhere: dict[int, Outcome] = {refusal.sequence: refusal.kind for refusal in report.refused}
         elsewhere.update(dict.fromkeys(report.dropped, Fate.DROPPED))
         for sequence, outcome in elsewhere.items():
@@ -175,6 +206,7 @@ class Account:
 
     def _write(self, first: int, end: int, outcome: Outcome) -> None:
         """Record the outcome of a range whose numbers have no outcome yet, or all the same one."""
+        self.changes += 1
         if (before := self.outcome(first)) is not None:
             self._counts[before] -= end - first
         self._counts[outcome] += end - first
@@ -205,13 +237,36 @@ class Account:
         return found
 
 
-def restored(memory: AccountSnapshot) -> Account:
-    """Return the account of a checkpoint; rollouts that were queued then are lost."""
+def restored(memory: AccountSnapshot, kept: Set[int] = frozenset()) -> Account:
+    """Return the account of a checkpoint. Its missing rollouts are in flight until its owner is known to be gone.
+
+    Args:
+        memory: The account as it was.
+        kept: Rollouts that the checkpoint holds; they are still queued. The others that were queued then are lost.
+    """
     account = Account(memory.actor, memory.incarnation)
-    account.is_alive = False  # until it reports
     in_order = sorted((first, end, name) for name, ranges in memory.outcomes for first, end in ranges)
     for first, end, name in in_order:
         outcome: Outcome = Fate(name) if name in FATES else VerdictKind(name)
         account._write(first, end, Fate.LOST if outcome is Fate.QUEUED else outcome)
+        if outcome is Fate.QUEUED:
+            for sequence in kept:
+                if first <= sequence < end:
+                    account._write(sequence, sequence + 1, Fate.QUEUED)
     account._published = max(account._published, memory.published)
     return account
+
+
+def folded(earlier: Account, account: Account) -> Account:
+    """Return ``earlier`` with the counts of one more account whose owner is gone; its missing rollouts are lost.
+
+    The result is as large as one account, whatever the number of lives in it. Its numbers name no rollouts.
+    """
+    counts = earlier._counts + account._counts
+    counts[Fate.LOST] += earlier.missing + account.missing
+    result = Account(earlier.actor, earlier.incarnation)
+    for outcome in sorted(counts, key=lambda outcome: outcome.value):
+        if counts[outcome]:
+            result._write(result.published, result.published + counts[outcome], outcome)
+    result.is_alive = False
+    return result

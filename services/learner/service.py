@@ -1,6 +1,7 @@
 """The learner's shell: takes rollouts in, trains epochs, broadcasts policies and stage changes, keeps the run."""
 
 import logging
+import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -10,6 +11,7 @@ from typing import Final
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, Rollout, StageChange, Verdict
 from common.comms.transport import Transport
+from common.comms.zenoh_config import endpoint_for_others
 from common.env.robot import home_action
 from common.env.teacher import teacher_of
 from common.errors import ReportedError
@@ -25,7 +27,8 @@ from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.divergence import NOT_FINITE
-from services.learner.intake import Intake
+from services.learner.generation import next_generation, yields
+from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot, Ledger
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
@@ -34,11 +37,17 @@ log = logging.getLogger(__name__)
 
 ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
 SERVED_AT_ONCE: Final = 64  # messages read between two gradient steps
-IDLE_WAIT_S: Final = 0.05
+IDLE_WAIT_S: Final = 0.2  # any arrival ends the wait
+NAMES_LOGGED: Final = 5  # of services that joined or left together
+TOKENS_ARRIVE_S: Final = 0.5  # longest time that the tokens of others take to arrive through a router
 
 
 class RunExistsError(ReportedError):
     """A new run would overwrite an old one's checkpoints."""
+
+
+class LearnerAliveError(ReportedError):
+    """The run has another learner."""
 
 
 class DivergedError(ReportedError):
@@ -74,6 +83,7 @@ class LearnerService:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
+        self._endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
         self._folder = RunFolder.of(config.run, config.folder)
         if not config.resume and checkpoint.checkpoints(self._folder.checkpoints):
             raise RunExistsError(
@@ -99,14 +109,15 @@ class LearnerService:
             frames=config.frames,
         )
         self._training_hash = training_hash(task, config.network, config.experience)
-        self._generation = int(time.time())
         self._clocks = Clocks(clock())
-        stages, accounts = self._restore() if config.resume else ((), ())
+        extras = self._restore() if config.resume else None
+        stages = tuple(StageChange(**change) for change in extras.stage_log) if extras else ()
+        self._generation = next_generation(self._folder.generation, extras.generation if extras else 0)
         # After the checkpoint has proved that they fit
         save_settings(self._folder.config, to_tables(config, "learner"))
         if not config.resume:
             self._run_log.truncate(0)  # rows of a process that ended before its first checkpoint
-        self._intake = Intake(self._intake_config, self._learner_state(), accounts)
+        self._intake = self._new_intake(extras)
         self._alive: set[tuple[str, str, int]] = set()
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
         keys = self._keys = self._member.keys
@@ -119,12 +130,16 @@ class LearnerService:
             transport, keys, self.training, identity, stages, config.evaluated_weights
         )
         self._members = transport.watch_alive(keys.every_alive())
+        self._joined: float | None = None  # [s] time of its own token
+        self._rivals: set[int] = set()  # generations of other learners whose tokens stand
         self._has_nothing_left = False
         self._warned = False
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         # Without it, a learner that waits for its first actor would seem to have no checkpoint since 1970.
         metrics.set("topspin_checkpoint_time_seconds", time.time())
+        self._wait_for_predecessor()
         self._member.join()
+        self._joined = clock()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
 
@@ -157,7 +172,7 @@ class LearnerService:
 
     def ledger(self) -> Ledger:
         """Return the ledger of all actors together."""
-        return sum(self._intake.ledgers().values(), Ledger())
+        return self._intake.total()
 
     # ---- work
 
@@ -165,13 +180,14 @@ class LearnerService:
         """Train until the budget is spent or ``stop`` is set; the run folder is complete afterwards."""
         config = self._config
         log.info(
-            "listening endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
+            "%s endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
             "--run %s --endpoint %s (and rallies with: python -m services.generator --run %s --endpoint %s)",
+            "listening" if config.mode == "hub" else "connected",
             config.endpoint,
             config.run,
             self.training.progress.epoch,
             config.curriculum.epochs,
-            *(config.run, config.endpoint) * 2,
+            *(config.run, self._endpoint) * 2,
         )
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
@@ -183,7 +199,7 @@ class LearnerService:
                     self._transport.wait(wait)
             self._member.state = "done"
         finally:
-            self.save()
+            self.save(is_last=True)
             self._beat()
             self._run_log.close()
             self._member.leave()
@@ -211,8 +227,12 @@ class LearnerService:
             self.save()
         return 0.0 if trained else IDLE_WAIT_S
 
-    def save(self) -> None:
-        """Write checkpoint and policy/latest; parameters that are not finite never replace good ones."""
+    def save(self, is_last: bool = False) -> None:
+        """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
+
+        Args:
+            is_last: Whether this process trains no more. Then the checkpoint also keeps the rollouts that wait.
+        """
         if not self.training.is_finite:
             log.error("not saved: parameters are not finite epoch=%d", self.training.progress.epoch)
             return
@@ -222,6 +242,8 @@ class LearnerService:
             stage_log=[asdict(change) for change in self._broadcast.stages],
             accounts=[entry.to_json() for entry in self._intake.snapshots()],
             trained_seconds=self.seconds,
+            closed=self._intake.closed,
+            queue=tuple(encode(entry.rollout) for entry in self._intake.waiting) if is_last else (),
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
         if self.training.progress.is_worth_going_back_to:
@@ -290,29 +312,74 @@ class LearnerService:
             datasets_left=self.training.datasets_left,
         )
 
-    def _restore(self) -> tuple[tuple[StageChange, ...], tuple[AccountSnapshot, ...]]:
-        """Load the newest checkpoint; return the stage changes and accounts of earlier lives."""
-        file = checkpoint.newest(self._folder.checkpoints)
-        extras = checkpoint.restore(file, self.training)
-        # Actors may still have policies of the previous learner. These must not seem newer than ours.
-        self._generation = max(self._generation, extras.generation + 1)
+    def _restore(self) -> checkpoint.Extras:
+        """Load the newest whole checkpoint; return what the service keeps in it."""
+        file, extras = checkpoint.restore_newest(self._folder.checkpoints, self.training)
         self._clocks.resumed_seconds = extras.trained_seconds
         self._run_log.truncate(self.training.progress.epoch)
         log.info(
-            "resumed file=%s epoch=%d frames=%d",
+            "resumed file=%s epoch=%d frames=%d waiting=%d",
             file,
             self.training.progress.epoch,
             self.training.progress.frames,
+            len(extras.queue),
         )
-        stages = tuple(StageChange(**change) for change in extras.stage_log)
-        return stages, tuple(AccountSnapshot.from_json(values) for values in extras.accounts)
+        return extras
+
+    def _new_intake(self, extras: checkpoint.Extras | None) -> Intake:
+        """Return an intake with the accounts and the waiting rollouts of a checkpoint, if there is one."""
+        learner = self._learner_state()
+        if extras is None:
+            return Intake(self._intake_config, learner)
+        limit = self._config.max_message_mib * 2**20
+        opened = [open_rollout(payload, limit, self.training.obs_size) for payload in extras.queue]
+        queue = [Queued(found[0], found[1]) for found in opened if found is not None and found[1] is not None]
+        accounts = [AccountSnapshot.from_json(values) for values in extras.accounts]
+        return Intake(self._intake_config, learner, accounts, queue, extras.closed)
+
+    def _wait_for_predecessor(self) -> None:
+        """Wait for the end of an earlier learner, whose token may stand for a moment after its death.
+
+        Raises:
+            LearnerAliveError: It lives on.
+        """
+        started = self._clock()
+        while True:
+            self._follow_members()
+            waited = self._clock() - started
+            patience = (
+                2.0 * self._config.lease_s if self._rivals else TOKENS_ARRIVE_S * self._may_be_elsewhere
+            )
+            if waited >= patience:
+                break
+            self._transport.wait(IDLE_WAIT_S)
+        if self._rivals:
+            raise LearnerAliveError(self._rival_text(max(self._rivals)))
+
+    @property
+    def _may_be_elsewhere(self) -> bool:
+        """Whether another learner may be at the same hub, or at one that is connected with it."""
+        return self._config.mode == "client" or bool(self._config.peers)
+
+    def _rival_text(self, generation: int) -> str:
+        return (
+            f"run {self._config.run!r} has another learner, generation {generation}, at the same hub: "
+            "end it first, or choose another --run"
+        )
 
     # ---- messages
 
     def _serve(self) -> None:
         """Answer waiting requests; also between gradient steps, so that no actor waits for an update."""
         now = self._clock()
+        self._member.note_link(now)
         self._follow_members()
+        for misfit in self._intake.take_new_misfits():
+            self._member.refuse(
+                "contract",
+                f"actor={misfit.actor} has training {misfit.training_hash or 'of an older release'}; allowed: "
+                f"{self._training_hash}: it gets no credits until [task], [network] and [experience] are the learner's",
+            )
         for _ in range(SERVED_AT_ONCE):
             request = self._rollouts.poll()
             if request is None:
@@ -334,18 +401,40 @@ class LearnerService:
         self._broadcast.answer()
 
     def _follow_members(self) -> None:
-        """Record which services have joined or gone."""
+        """Record which services have joined or gone, and log it: one line however many they are."""
+        changes: dict[bool, list[str]] = {True: [], False: []}
         for event in self._members.poll():
             try:
                 member = self._keys.member(event.key)
             except ValueError as error:  # KeyPartError, or digits that are no number
                 self._member.refuse("alive", error)
                 continue
-            (self._alive.add if event.alive else self._alive.discard)(
-                (member.role, member.id, member.incarnation)
-            )
+            if member.role == "learner":
+                self._meet(member.incarnation, event.alive)
+                continue
+            life = (member.role, member.id, member.incarnation)
+            changes[event.alive].append(f"{member.role}/{member.id}")
+            (self._alive.add if event.alive else self._alive.discard)(life)
             if member.role == "actor":
                 (self._intake.seen if event.alive else self._intake.gone)(member.id, member.incarnation)
+        for is_alive, names in changes.items():
+            if names:
+                text = ", ".join(names[:NAMES_LOGGED]) + (" and others" if len(names) > NAMES_LOGGED else "")
+                log.info(
+                    "%s=%d %s; alive=%d", "joined" if is_alive else "gone", len(names), text, len(self._alive)
+                )
+
+    def _meet(self, generation: int, is_alive: bool) -> None:
+        """Note that the token of another learner of this run stands, or has ended."""
+        (self._rivals.add if is_alive else self._rivals.discard)(generation)
+        if not is_alive or self._joined is None:
+            return
+        text = self._rival_text(generation)
+        # A hub that starts sees no token before its own, and the others wait for its token
+        settling_s = 2.0 * TOKENS_ARRIVE_S * self._may_be_elsewhere
+        if yields(self._generation, generation, self._clock() - self._joined, settling_s):
+            raise LearnerAliveError(text)
+        log.error("%s; this one goes on, since it was first", text)
 
     def _report(self, report: ActorReport) -> Verdict:
         return self._intake.report(report, self._clock())
@@ -361,14 +450,15 @@ class LearnerService:
                 "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s --endpoint %s",
                 now - since,
                 self._config.run,
-                self._config.endpoint,
+                self._endpoint,
             )
         else:
             log.warning(
-                "waiting for=rollouts have=%d of=%d actors=%d",
+                "waiting for=rollouts have=%d of=%d actors=%d with_another_contract=%d",
                 self._intake.queued,
                 self._intake_config.dataset_rollouts,
                 actors,
+                len(self._intake.misfits),
             )
 
     # ---- numbers
@@ -387,6 +477,7 @@ class LearnerService:
         )
 
     def _beat(self) -> None:
+        self._intake.tidy(self._clock())
         ledger, queued = self.ledger(), self._intake.queued
         telemetry.measure_state(self._metrics, ledger, self._intake, (role for role, _, _ in self._alive))
         counters, gauges = telemetry.heartbeat(
@@ -395,6 +486,6 @@ class LearnerService:
             self.seconds,
             ledger,
             queued,
-            self._last,
+            self._last | {"misfits": len(self._intake.misfits)},
         )
         self._member.beat(counters, gauges)

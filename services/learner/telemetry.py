@@ -91,6 +91,7 @@ def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Itera
         metrics.set("topspin_ledger_rollouts", count, fate=fate)
     metrics.set("topspin_queue_depth", intake.queued)
     metrics.set("topspin_rollout_gaps", intake.gaps())
+    metrics.set("topspin_misfit_actors", len(intake.misfits))
     roles = list(alive)
     for role in _MEMBERS:
         metrics.set("topspin_alive", roles.count(role), role=role)

@@ -9,8 +9,16 @@ from multiprocessing.synchronize import Event
 
 import pytest
 
+from common.comms import transport
 from common.comms.memory_transport import MemoryBroker
-from common.comms.transport import AliveEvent, Flow, NoReply, Reply, Transport, TransportError
+from common.comms.transport import (
+    AliveEvent,
+    Flow,
+    NoReply,
+    Reply,
+    Transport,
+    TransportError,
+)
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from tests.contract.transports import RUN, answered, free_port, subscribed, taken, until
@@ -211,3 +219,84 @@ def test_a_process_that_does_not_close_still_exits():
     process.join(20.0)
 
     assert process.exitcode == 7
+
+
+def ask_and_hang(endpoint: str, requests: int) -> None:
+    client = open_zenoh(ZenohConfig(endpoint=endpoint))
+    while not isinstance(client.request(f"{RUN}/policy", b"probe", 5.0, Flow.POLICY).wait(), Reply):
+        time.sleep(0.05)
+    for _ in range(requests):
+        client.request(f"{RUN}/policy", b"", 30.0, Flow.POLICY)
+    time.sleep(0.2)
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def test_a_client_that_hangs_after_a_hundred_requests_delays_neither_the_hub_nor_the_others():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    hub = open_zenoh(ZenohConfig(mode="hub", endpoint=endpoint))
+    policies, control = hub.serve(f"{RUN}/policy", capacity=256), hub.serve(f"{RUN}/ctl", capacity=16)
+    other = open_zenoh(ZenohConfig(endpoint=endpoint))
+    answered(other, control, f"{RUN}/ctl")
+    process = get_context("spawn").Process(target=ask_and_hang, args=(endpoint, 100), daemon=True)
+    process.start()
+    try:
+        probe = policies.poll(timeout_s=20.0)
+        assert probe is not None
+        probe.reply(b"")
+        time.sleep(1.0)  # it asks and stops
+        blob = bytes(1_000_000)
+        longest = slowest = 0.0
+        end = time.monotonic() + 8.0
+        pending, asked = other.request(f"{RUN}/ctl", b"", 5.0, Flow.CONTROL), time.monotonic()
+        outcomes, policies_asked = [], 0
+        while time.monotonic() < end:
+            started = time.monotonic()
+            for server, answer in ((policies, blob), (control, b"")):
+                while (request := server.poll()) is not None:
+                    request.reply(answer)
+                    policies_asked += server is policies
+            longest = max(longest, time.monotonic() - started)
+            if (outcome := pending.poll()) is not None:
+                outcomes.append(outcome)
+                slowest = max(slowest, time.monotonic() - asked)
+                pending, asked = other.request(f"{RUN}/ctl", b"", 5.0, Flow.CONTROL), time.monotonic()
+            hub.wait(0.01)
+    finally:
+        process.kill()  # a process that is stopped does not end on SIGTERM
+        process.join(5.0)
+        other.close()
+        hub.close()
+
+    assert policies_asked == 100
+    assert set(map(type, outcomes)) == {Reply}
+    assert longest < 1.0  # before: 15 s
+    assert slowest < 2.0  # before: no answer any more
+
+
+def test_a_session_whose_requests_time_out_on_a_live_link_is_opened_again(monkeypatch, caplog):
+    monkeypatch.setattr(transport, "STUCK_AFTER_S", 0.5)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    hub = open_zenoh(ZenohConfig(mode="hub", endpoint=endpoint))
+    server = hub.serve(f"{RUN}/ctl", capacity=16)
+    watch = hub.watch_alive(f"{RUN}/alive/**")
+    client = open_zenoh(ZenohConfig(endpoint=endpoint))
+    policies = client.subscribe(f"{RUN}/policy", capacity=1)
+    token = client.declare_alive(f"{RUN}/alive/actor/0/1")
+    subscribed(hub, f"{RUN}/policy")
+    for _ in range(3):
+        assert client.request(f"{RUN}/ctl", b"", 0.3, Flow.CONTROL).wait() is NoReply.TIMEOUT
+    time.sleep(0.5)
+    while server.poll() is not None:
+        pass
+    client.wait(0.1)
+
+    assert "requests without answer count=3 on a live link" in caplog.text
+    until(lambda: client.reconnect_count == 1)
+    answered(client, server, f"{RUN}/ctl")
+    until(lambda: (hub.publish(f"{RUN}/policy", b"new", Flow.POLICY), policies.poll())[1] != [])
+    events: list[bool] = []
+    until(lambda: (events.extend(event.alive for event in watch.poll()), events[-1:] == [True])[1])
+    token.close()
+    until(lambda: (events.extend(event.alive for event in watch.poll()), events[-1:] == [False])[1])
+    client.close()
+    hub.close()

@@ -234,7 +234,7 @@ def bad_outcome():
 
 
 def bad_rallies():
-    rallies = np.zeros((4, 11))
+    rallies = np.zeros((4, 12))
     rallies[:, 3] = 1e200
     return RallyBatch(
         source="wild",

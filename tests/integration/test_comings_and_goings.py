@@ -132,6 +132,35 @@ def test_a_restarted_learner_continues_from_its_checkpoint_and_its_actors_follow
     assert min(reconnects) >= 1
 
 
+def test_a_planned_stop_and_resume_lose_nothing(tmp_path):
+    """Rollouts that wait at the stop are kept and trained: `lost` is an alarm."""
+    with local_run(tmp_path, curriculum=LONG, intake=IntakeConfig(dataset_rollouts=3)) as s:
+        learner = s.learner()
+        s.generator()
+        actors = [s.actor(0), s.actor(1)]
+        wait_until(lambda: progress(learner).epoch >= 3, 60, "training")
+        for actor in actors:
+            actor.end()
+        wait_until(lambda: learner.service._intake.queued < 3, 10, "less than a dataset to wait")
+        s.take_down(learner)
+        stopped = learner.service.ledger()
+        again = s.learner(resume=True)
+        resumed = again.service.ledger()
+        actors = [s.actor(0), s.actor(1)]
+        epoch = progress(again).epoch
+        wait_until(lambda: progress(again).epoch >= epoch + 3, 60, "training to go on")
+        for actor in actors:
+            actor.end()
+        again.end()
+        ledger = again.service.ledger()
+
+    assert (stopped.lost, resumed.lost, ledger.lost) == (0, 0, 0)
+    assert resumed.in_flight == stopped.in_flight
+    assert ledger.balance == 0
+    assert ledger.refused == {}
+    assert ledger.trained == 3 * progress(again).epoch
+
+
 def test_an_actor_that_leaves_sends_its_unanswered_rollouts(tmp_path):
     with local_run(tmp_path, curriculum=LONG) as s:
         learner = s.learner()
@@ -158,7 +187,9 @@ def test_an_actor_that_leaves_sends_its_unanswered_rollouts(tmp_path):
 
     assert left.in_flight == left.balance == 0
     assert ledger.balance == 0
-    assert ledger.lost == left.accepted - ledger.trained  # accepted by the first learner and not trained
+    # what the first learner accepted and did not train still waits: its checkpoint kept it
+    assert ledger.in_flight == left.accepted - ledger.trained
+    assert ledger.lost == 0
     assert ledger.published == left.published
 
 

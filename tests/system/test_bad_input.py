@@ -199,8 +199,7 @@ def test_an_actor_without_a_learner_logs_its_wait_and_ends_on_a_signal(tmp_path)
         with running(tmp_path, ACTOR, *flags) as actor:
             wait_until(
                 lambda: (
-                    "waiting for='a policy from the learner on topspin/v1/default/policy'"
-                    in actor.err.read_text()
+                    "waiting for=\"a learner: run 'default' has none at the hub\"" in actor.err.read_text()
                 ),
                 60,
                 "the actor to name the learner",

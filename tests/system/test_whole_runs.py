@@ -160,6 +160,34 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
     assert (log.stage, int(rows(tmp_path)[-1]["stage"])) == (3, 3)
 
 
+def test_a_killed_learner_and_a_hung_actor_come_back_by_themselves(tmp_path):
+    flags = ("--run", "r", "--actors", 2, *TINY, *STAGES, "--learner.curriculum.stage-3", 100_000)
+    flags += ("--watchdog-s", 6, "--learner.checkpoint-interval-s", 1)
+    with running(tmp_path, "deploy.local", *flags) as command:
+        wait_until(lambda: len(rows(tmp_path)) >= 60, 90, "training")
+        wait_until(lambda: list((tmp_path / "runs/r/checkpoints").glob("*.safetensors")), 30, "a checkpoint")
+        (learner,) = children_of(tmp_path, "learner").values()
+        learner.kill()
+        log = tmp_path / "runs" / "r" / "logs" / "learner-0.log"
+        wait_until(lambda: "resumed file=" in log.read_text(), 60, "the learner's next life")
+        epoch = len(rows(tmp_path))
+        wait_until(lambda: len(rows(tmp_path)) >= epoch + 20, 60, "training to go on")
+        hung = next(p for p in children_of(tmp_path, "actor").values() if "--id" in p.cmdline())
+        hung.suspend()
+        wait_until(lambda: "process hangs name=actor-" in command.err.read_text(), 60, "the watchdog")
+        epoch = len(rows(tmp_path))
+        wait_until(lambda: len(rows(tmp_path)) >= epoch + 20, 60, "training to go on again")
+        command.process.send_signal(signal.SIGINT)
+        status, out, err = command.wait(60)
+    ledger = last_json(out)["ledger"]
+
+    assert status == 130, err
+    assert "process died name=learner-0" in err
+    assert "status=-9" in err
+    assert ledger["published"] == sum(ledger[fate] for fate in FATES)
+    assert "go on with: python -m deploy.local --run r --resume" in err
+
+
 def test_a_second_interrupt_ends_everything_at_once(tmp_path):
     with running(tmp_path, "deploy.local", "--run", "r", "--actors", 1, *TINY) as command:
         wait_until(lambda: len(rows(tmp_path)) >= 1, 90, "the first epoch")

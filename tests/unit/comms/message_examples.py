@@ -95,7 +95,7 @@ EXAMPLES: tuple[Any, ...] = (
         sequence=5,
         shard=0,
         block=9,
-        rallies=np.arange(22, dtype="<f8").reshape(2, 11),
+        rallies=np.arange(24, dtype="<f8").reshape(2, 12),
         seeds=np.array([1, 2**64 - 1], "<u8"),
         candidates=7,
         launch="paper",

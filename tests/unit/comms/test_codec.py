@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from common.comms.budgets import one_line
 from common.comms.codec import DecodeError, EncodeError, decode, decode_one_of, encode, salvage
 from common.comms.messages import (
     MESSAGES,
@@ -262,6 +263,6 @@ def test_any_content_of_a_field_raises_nothing_but_a_decode_error(message, index
 
 @given(st.integers(0, 2**62), st.sampled_from(VerdictKind), st.text(max_size=50))
 def test_any_valid_verdict_survives_the_wire(number, kind, reason):
-    verdict = make_verdict(kind=kind, reason=reason, generation=number)
+    verdict = make_verdict(kind=kind, reason=one_line(reason), generation=number)
 
     assert decode(encode(verdict), Verdict) == verdict

@@ -2,7 +2,7 @@
 
 import pytest
 
-from common.comms.transport import Bell, Mailbox, Request, Server
+from common.comms.transport import MAILBOX_BYTES, Bell, Mailbox, Request, Server
 
 
 @pytest.mark.parametrize("keep", ["newest", "oldest"])
@@ -28,3 +28,14 @@ def test_a_request_that_arrives_while_its_server_closes_is_refused():
 
     assert answers == [None]
     assert not inbox.put(2)
+
+
+def test_a_mailbox_holds_a_bounded_number_of_bytes():
+    newest, oldest = (Mailbox(Bell(), 100, keep=keep) for keep in ("newest", "oldest"))
+    size = MAILBOX_BYTES // 3
+    kept = [[box.put(number, size) for number in range(5)] for box in (newest, oldest)]
+
+    assert kept == [[True] * 5, [True, True, True, False, False]]
+    assert (newest.take_all(), oldest.take_all()) == ([2, 3, 4], [0, 1, 2])
+    assert (newest.dropped, oldest.dropped) == (2, 2)
+    assert oldest.put(5, 2 * MAILBOX_BYTES)  # one message is always taken

@@ -1,7 +1,7 @@
 import pytest
 from pydantic import ValidationError
 
-from common.comms.zenoh_config import ZenohConfig, session_settings
+from common.comms.zenoh_config import ZenohConfig, endpoint_for_others, session_settings
 
 FILES = {"tls_ca": "ca.pem", "tls_certificate": "learner.pem", "tls_key": "learner.key"}
 
@@ -32,6 +32,19 @@ def test_features_that_corrupt_or_expose_data_are_off():
         "adminspace/enabled",
     ):
         assert settings[path] is False
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "wanted"),
+    [
+        ("tcp/0.0.0.0:7447", "tcp/hall:7447"),
+        ("tls/[::]:7447", "tls/hall:7447"),
+        ("tcp/127.0.0.1:7447", "tcp/127.0.0.1:7447"),
+        ("unixsock-stream//tmp/hub", "unixsock-stream//tmp/hub"),
+    ],
+)
+def test_the_endpoint_for_others_is_one_that_they_can_reach(endpoint, wanted):
+    assert endpoint_for_others(endpoint, "hall") == wanted
 
 
 def test_a_tls_endpoint_and_only_that_needs_certificates():

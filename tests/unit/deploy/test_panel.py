@@ -4,7 +4,7 @@ from dataclasses import replace
 from rich.console import Console
 
 from common.comms.messages import Status
-from deploy.panel import View, clock, render, share_done, time_left_s
+from deploy.panel import MOST_SERVICES, View, clock, render, share_done, time_left_s
 
 
 def make_status(role, id_="0", counters=None, gauges=None, state="playing"):
@@ -89,3 +89,19 @@ def test_without_a_number_of_epochs_the_frames_decide_the_time_left():
     view.minutes, view.frames = 0.0, 100
 
     assert share_done(view) == 0.3
+
+
+def test_a_peer_of_many_names_does_not_fill_the_panel():
+    view = View("night")
+    for number in range(MOST_SERVICES + 10):
+        view.hear(make_status("actor", str(number)), 0.0)
+
+    assert len(view.statuses) == MOST_SERVICES
+
+
+def test_actors_of_another_contract_are_shown():
+    view = full_view()
+    assert "another contract" not in shown(view)
+    view.hear(make_status("learner", gauges={"misfits": 2.0}), 9.0)
+
+    assert "2 actors of another contract" in shown(view)

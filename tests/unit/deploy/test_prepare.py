@@ -48,7 +48,8 @@ def test_the_topology_is_one_learner_and_restarted_workers_each_with_its_own_por
     assert [spec.name for spec in specs] == [
         *("learner-0", "evaluator-0", "generator-0", "generator-1", "actor-0", "actor-1", "actor-2"),
     ]
-    assert [spec.name for spec in specs if not spec.restart] == ["learner-0"]
+    assert all(spec.restart for spec in specs)
+    assert [spec.name for spec in specs if spec.keeps_run] == ["learner-0"]
     assert [int(flag(spec, "--metrics-port")) for spec in specs] == list(range(9100, 9107))
     assert metrics_ports(CONFIG) == list(range(9100, 9107))
     assert [flag(spec, "--index") for spec in specs if spec.role == "actor"] == ["0", "1", "2"]

@@ -6,7 +6,15 @@ import pytest
 
 from common.service.process import BAD_CONFIG
 from deploy.child import Assignment
-from deploy.supervisor import RESTART_PAUSE_MAX_S, RESTART_PAUSE_S, Spec, Supervisor, restart_pause
+from deploy.supervisor import (
+    KEEPER_DEATHS,
+    RESTART_PAUSE_MAX_S,
+    RESTART_PAUSE_S,
+    Spec,
+    Supervisor,
+    next_start,
+    restart_pause,
+)
 
 
 def wait_until(condition, timeout_s=20.0):
@@ -22,6 +30,28 @@ def test_pauses_before_restarts_double_up_to_a_bound():
     assert pauses[:3] == [RESTART_PAUSE_S, 2 * RESTART_PAUSE_S, 4 * RESTART_PAUSE_S]
     assert pauses[-1] == RESTART_PAUSE_MAX_S
     assert pauses == sorted(pauses)
+
+
+WORKER = Spec("actor-0", "actor", ("m",), restart=True)
+KEEPER = Spec("learner-0", "learner", ("m",), restart=True, keeps_run=True)
+
+
+@pytest.mark.parametrize(
+    ("spec", "status", "life_s", "deaths", "pause"),
+    [
+        (WORKER, -9, 1.0, 1, RESTART_PAUSE_S),
+        (WORKER, 1, 1.0, 99, RESTART_PAUSE_MAX_S),
+        (WORKER, BAD_CONFIG, 99.0, 1, None),
+        (KEEPER, -9, 1.0, 1, RESTART_PAUSE_S),
+        (KEEPER, -9, 1.0, 3, 4 * RESTART_PAUSE_S),
+        (KEEPER, -9, 1.0, KEEPER_DEATHS + 1, None),
+        (KEEPER, 0, 99.0, 1, None),
+        (KEEPER, 1, 1.0, 1, None),  # a taken port: the next one would fail in the same way
+        (KEEPER, 1, 99.0, 1, RESTART_PAUSE_S),
+    ],
+)
+def test_a_dead_process_is_restarted_where_that_can_help(spec, status, life_s, deaths, pause):
+    assert next_start(spec, status, life_s, deaths) == pause
 
 
 def test_an_assignment_survives_the_pipe():
@@ -96,3 +126,16 @@ def test_a_process_ends_with_the_holder_of_its_pipe(tmp_path, service):
     process.stdin.close()
 
     assert process.wait(20) == -signal.SIGTERM
+
+
+def test_the_process_that_keeps_the_run_gets_more_flags_at_a_restart(tmp_path, service):
+    spec = Spec("worker-0", "learner", (service, "stay"), True, keeps_run=True, again=lambda: ("--resume",))
+    supervisor = Supervisor([spec], tmp_path)
+    log = tmp_path / "worker-0.log"
+    wait_until(lambda: "started stay" in log.read_text())
+    supervisor.kill("worker-0")
+    wait_until(lambda: (supervisor.watch(time.monotonic()), "started stay --resume" in log.read_text())[1])
+    ended = supervisor.has_ended("worker-0")
+    supervisor.stop(["worker-0"], 5.0)
+
+    assert not ended

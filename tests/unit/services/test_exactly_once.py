@@ -47,7 +47,14 @@ class Actor:
             self.accepted.add(sequence)
 
     def report(self) -> ActorReport:
-        return ob.report(self.outbox, run="night", actor=self.name, incarnation=self.incarnation, version=0)
+        return ob.report(
+            self.outbox,
+            run="night",
+            actor=self.name,
+            incarnation=self.incarnation,
+            version=0,
+            training_hash=LEARNER_STATE.training_hash,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +65,7 @@ class Checkpoint:
     accounts: tuple[AccountSnapshot, ...]
     trained: frozenset[Key]
     judged: dict[Key, VerdictKind]
+    queue: tuple[Queued, ...] = ()  # kept at a planned stop
 
 
 class World(RuleBasedStateMachine):
@@ -173,8 +181,10 @@ class World(RuleBasedStateMachine):
     @rule(pick=st.integers(0, 50), arrives=st.booleans())
     def answer(self, pick: int, arrives: bool) -> None:
         actor, sequence, verdict = self.replies.pop(pick % len(self.replies))
-        if arrives:
+        if arrives and self.intake is not None and verdict.generation == self.intake.learner.generation:
             actor.hear(sequence, verdict, self.now)
+        elif arrives:  # the token of the learner that answered is gone
+            actor.outbox = ob.unanswered(actor.outbox, sequence, self.now)
 
     @precondition(lambda self: bool(self.reports) and self.intake is not None)
     @rule(pick=st.integers(0, 50), repeat=st.booleans())
@@ -231,12 +241,20 @@ class World(RuleBasedStateMachine):
         if chance == 0:
             self.intake, self.dataset = None, ()
 
+    @precondition(lambda self: self.intake is not None and not self.dataset)
+    @rule(chance=st.integers(0, 3))
+    def stop_learner_as_planned(self, chance: int) -> None:
+        if chance == 0:
+            self.save()
+            self.checkpoint = dataclasses.replace(self.checkpoint, queue=self.intake.waiting)
+            self.intake = None
+
     @precondition(lambda self: self.intake is None)
     @rule()
     def restart_learner(self) -> None:
         self.generations += 1
         learner = dataclasses.replace(self.checkpoint.learner, generation=self.generations)
-        self.intake = Intake(INTAKE, learner, self.checkpoint.accounts)
+        self.intake = Intake(INTAKE, learner, self.checkpoint.accounts, self.checkpoint.queue)
         self.out_of_sight = set()
         self.trained = set(self.checkpoint.trained)
         self.judged = dict(self.checkpoint.judged)
@@ -259,7 +277,10 @@ class World(RuleBasedStateMachine):
         for ledger in ledgers.values():
             assert ledger.balance == 0
             assert min(ledger.trained, ledger.dropped, ledger.in_flight, ledger.lost) >= 0
-        assert sum(ledgers.values(), Ledger()).trained == len(self.trained)
+        assert self.intake.total() == sum(ledgers.values(), Ledger())
+        assert self.intake.total().trained == len(self.trained)
+        assert self.intake.gaps() == sum(account.gaps for account in self.intake._accounts.values())
+        assert self.intake._promised == sum(self.intake._holders.values())
 
     @invariant()
     def of_actors_without_token_only_queued_rollouts_are_in_flight(self) -> None:

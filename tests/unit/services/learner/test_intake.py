@@ -7,9 +7,18 @@ import pytest
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, VerdictKind
 from services.actor.outbox import Flight, Outbox, OutboxConfig, report
+from services.learner import intake as intake_module
 from services.learner.admission import RULES, open_rollout
-from services.learner.intake import Intake, IntakeConfig
-from services.learner.ledger import Account, AccountSnapshot, Fate, restored
+from services.learner.intake import (
+    EARLIER,
+    FOLD_AFTER_S,
+    IDLE_REPORTS_HZ,
+    LONGEST_JUMP,
+    SOONEST_REPORT_S,
+    Intake,
+    IntakeConfig,
+)
+from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
 from tests.unit.comms.message_examples import make_rollout
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake
@@ -114,7 +123,15 @@ def test_rollouts_that_wait_at_a_stage_change_are_lost_and_counted():
 
 
 def make_report(outbox: Outbox, leaving: bool = False) -> ActorReport:
-    return report(outbox, run="night", actor="actor-0", incarnation=1, version=10, leaving=leaving)
+    return report(
+        outbox,
+        run="night",
+        actor="actor-0",
+        incarnation=1,
+        version=10,
+        training_hash=LEARNER_STATE.training_hash,
+        leaving=leaving,
+    )
 
 
 def test_a_late_report_of_a_dead_actor_does_not_make_it_alive():
@@ -240,7 +257,8 @@ def test_a_checkpoint_keeps_every_outcome_and_queued_rollouts_are_lost():
     again = Intake(IntakeConfig(), dataclasses.replace(LEARNER_STATE, generation=2), accounts)
 
     ledger = again.ledgers()["actor-0", 1]
-    assert (ledger.published, ledger.trained, ledger.lost) == (7, 2, 4)
+    # numbers 3 and 4 may still arrive: their actor has not been heard yet
+    assert (ledger.published, ledger.trained, ledger.lost, ledger.in_flight) == (7, 2, 2, 2)
     assert ledger.refused == {VerdictKind.STALE_STAGE: 1}
     assert ledger.balance == 0
     verdict = again.arrive(make_header(0), ROLLOUT, 0.0)
@@ -254,3 +272,168 @@ def test_a_restored_account_settles_nothing_twice():
 
     assert account.ledger().trained == 1
     assert account.ledger() == restored(account.snapshot()).ledger()
+
+
+def kept(intake: Intake, **changes) -> Intake:
+    """Return the intake of the next learner after a planned stop."""
+    accounts = [
+        AccountSnapshot.from_json(json.loads(json.dumps(entry.to_json()))) for entry in intake.snapshots()
+    ]
+    learner = dataclasses.replace(intake.learner, generation=2, **changes)
+    config = IntakeConfig(dataset_rollouts=2)
+    return Intake(config, learner, accounts, intake.waiting, intake.closed)
+
+
+def test_rollouts_that_wait_at_a_planned_stop_are_trained_by_the_next_learner():
+    intake = make_intake(dataset_rollouts=2)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    again = kept(intake)
+    assert again.total().in_flight == 1
+    again.arrive(make_header(1, generation=2), ROLLOUT, 0.0)
+    dataset = again.take_dataset()
+    again.finish_update(dataclasses.replace(again.learner, version=11))
+
+    assert [entry.header.sequence for entry in dataset] == [0, 1]
+    assert (again.total().trained, again.total().lost, again.total().balance) == (2, 0, 0)
+
+
+def test_kept_rollouts_that_do_not_fit_the_new_settings_are_refused_with_the_reason():
+    intake = make_intake(dataset_rollouts=2)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    again = kept(intake, training_hash="f00")
+
+    assert again.queued == 0
+    assert again.total().refused == {VerdictKind.WRONG_CONTRACT: 1}
+    assert (again.total().lost, again.total().balance) == (0, 0)
+
+
+def test_missing_rollouts_of_a_checkpoint_are_lost_only_when_their_actor_stays_away():
+    intake = make_intake()
+    intake.report(make_report(Outbox(OutboxConfig(), next_sequence=1, generation=1, flights=(FLIGHT,))), 0.0)
+    again = kept(intake)
+    again.tidy(100.0)
+    again.tidy(129.0)
+    assert (again.total().in_flight, again.total().lost) == (1, 0)
+    again.tidy(131.0)
+
+    assert (again.total().in_flight, again.total().lost) == (0, 1)
+
+
+def test_an_actor_of_another_contract_gets_no_credits_and_is_named_once():
+    intake = make_intake(dataset_rollouts=2, max_lag=0)
+    misfit = dataclasses.replace(make_report(Outbox(OutboxConfig())), actor="misfit", training_hash="f00")
+    verdicts = [intake.report(misfit, float(second)) for second in range(8)]
+    eager = intake.report(make_report(Outbox(OutboxConfig())), 8.0)
+
+    assert {verdict.credit_limit for verdict in verdicts} == {0}
+    assert verdicts[0].kind is VerdictKind.WRONG_CONTRACT
+    assert verdicts[0].reason == "training f00; allowed: c0ffee"
+    assert eager.credit_limit == 2
+    assert [found.actor for found in intake.take_new_misfits()] == ["misfit"]
+    assert intake.take_new_misfits() == []
+    assert len(intake.misfits) == 1
+    intake.gone("misfit", 1)
+    assert intake.misfits == ()
+
+
+def test_a_report_for_another_run_makes_no_account():
+    intake = make_intake()
+    verdict = intake.report(dataclasses.replace(make_report(Outbox(OutboxConfig())), run="day"), 0.0)
+
+    assert (verdict.kind, verdict.credit_limit) == (VerdictKind.WRONG_RUN, 0)
+    assert intake.ledgers() == {}
+
+
+def test_credits_that_are_not_used_age_out_although_their_holder_reports():
+    intake = make_intake(dataset_rollouts=2, max_lag=0, credit_patience_s=30.0)
+    idle, eager = make_report(Outbox(OutboxConfig())), make_report(Outbox(OutboxConfig()))
+    eager = dataclasses.replace(eager, actor="eager")
+    for second in range(29):
+        assert intake.report(idle, float(second)).credit_limit == 2
+        assert intake.report(eager, float(second)).credit_limit == 0
+    intake.report(idle, 31.0)
+
+    assert intake.report(eager, 31.0).credit_limit == 2
+
+
+def test_a_claim_of_many_rollouts_in_flight_holds_no_more_than_the_window():
+    intake = make_intake(dataset_rollouts=4, max_lag=0, window=2)
+    wild = make_report(Outbox(OutboxConfig(), next_sequence=2**53, generation=1))
+    intake.report(dataclasses.replace(wild, actor="wild", generation=0), 0.0)
+
+    assert intake.report(make_report(Outbox(OutboxConfig())), 0.0).credit_limit == 2
+
+
+def test_an_actor_whose_rollouts_are_refused_in_a_row_pauses_and_the_others_get_its_credits():
+    intake = make_intake(dataset_rollouts=1, max_lag=0)
+    limits = [
+        intake.arrive(make_header(n, actor="bad", fault="nan"), None, 0.0).credit_limit for n in range(3)
+    ]
+
+    assert limits == [2, 3, 3]
+    assert intake.report(make_report(Outbox(OutboxConfig())), 0.0).credit_limit == 1
+
+
+def test_waiting_actors_report_less_often_the_more_they_are():
+    intake = make_intake(dataset_rollouts=1)
+    report_ = make_report(Outbox(OutboxConfig()))
+    few = intake.report(report_, 0.0).report_after_s
+    for number in range(1000):
+        many = intake.report(dataclasses.replace(report_, actor=f"a{number}"), 0.0).report_after_s
+
+    assert few == SOONEST_REPORT_S
+    assert many == pytest.approx(1001 / IDLE_REPORTS_HZ)
+
+
+def test_earlier_lives_are_one_account_and_the_total_stays():
+    intake = make_intake(dataset_rollouts=1, window=2)
+    for life in range(1, 51):
+        header = make_header(0, incarnation=life)
+        intake.arrive(header, ROLLOUT, 0.0)
+        intake.arrive(dataclasses.replace(header, sequence=3, stage_number=0), ROLLOUT, 0.0)
+        if intake.take_dataset():
+            intake.finish_update(intake.learner)
+        intake.gone("actor-0", life)
+    before = intake.total()
+    intake.tidy(0.0)
+    assert len(intake.ledgers()) == 50
+    intake.tidy(FOLD_AFTER_S + 1.0)
+
+    assert set(intake.ledgers()) == {EARLIER, ("actor-0", 50)}
+    assert intake.total() == before == sum(intake.ledgers().values(), Ledger())
+    assert (before.published, before.balance) == (200, 0)
+    late = intake.arrive(make_header(1, incarnation=3), ROLLOUT, 700.0)
+    assert late.kind is VerdictKind.INVALID
+    assert "life 3 of actor actor-0 ended" in late.reason
+    assert intake.total() == before
+    again = kept(intake)
+    assert again.total().published == 200
+    assert again.arrive(make_header(1, incarnation=3), ROLLOUT, 0.0).kind is VerdictKind.INVALID
+
+
+def test_a_number_far_beyond_those_of_its_actor_changes_no_account():
+    intake = make_intake()
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    before = intake.total()
+    wild = intake.arrive(make_header(2**53), ROLLOUT, 0.0)
+    claim = make_report(Outbox(OutboxConfig(), next_sequence=2**53, generation=1))
+    answer = intake.report(claim, 0.0)
+
+    assert wild.kind is VerdictKind.INVALID
+    assert wild.reason == f"number {2**53}; allowed: up to {3 + LONGEST_JUMP}"
+    assert answer.credit_limit == 0
+    assert intake.total() == before
+
+
+def test_a_peer_of_many_names_gets_a_bounded_number_of_accounts(monkeypatch):
+    monkeypatch.setattr(intake_module, "MOST_ACCOUNTS", 20)
+    intake = make_intake(dataset_rollouts=1)
+    claim = make_report(Outbox(OutboxConfig(), next_sequence=1, generation=1, flights=(FLIGHT,)))
+    for number in range(100):
+        intake.report(dataclasses.replace(claim, actor=f"a{number}", leaving=number % 2 == 0), 0.0)
+
+    assert len(intake.ledgers()) <= 21  # with that of earlier lives
+    assert intake.total() == sum(intake.ledgers().values(), Ledger())
+    refused = intake.report(dataclasses.replace(claim, actor="last"), 0.0)
+    assert refused.reason == "actor last is one too many; allowed: 20 with an account"
+    assert refused.credit_limit == 0

@@ -101,7 +101,8 @@ def test_rollouts_of_a_long_life_for_an_earlier_learner_are_one_range():
     book = account.ledger()
     assert (book.published, book.dropped, book.in_flight, book.lost) == (10**9, 1, 1, 10**9 - 2)
     assert account.ranges == 4
-    assert restored(account.snapshot()).ledger().lost == 10**9 - 1
+    again = restored(account.snapshot()).ledger()  # its actor may still send the one in flight
+    assert (again.lost, again.in_flight) == (10**9 - 2, 1)
 
 
 NUMBERS = st.integers(0, 30)

@@ -1,0 +1,67 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from deploy.watchdog import LOOK_S, MOST_LIMITS, Pulse, Watchdog, cpu_seconds, hung, is_hung
+
+LIMIT = 60.0
+
+
+@pytest.mark.parametrize(
+    ("pulse", "now", "hangs"),
+    [
+        (Pulse(0.0), 59.0, False),
+        (Pulse(0.0), 61.0, True),  # it never started to work
+        (Pulse(0.0, busy=50.0), 100.0, False),  # it compiles
+        (Pulse(0.0, heard=50.0), 100.0, False),
+        (Pulse(0.0, heard=50.0), 111.0, True),
+        (Pulse(0.0, heard=50.0, busy=110.0), 111.0, False),  # a long update
+        (
+            Pulse(0.0, heard=0.0, busy=MOST_LIMITS * LIMIT),
+            MOST_LIMITS * LIMIT + 1.0,
+            True,
+        ),  # it turns in a circle
+        (Pulse(100.0, heard=50.0), 111.0, False),  # the heartbeat was of its earlier life
+    ],
+)
+def test_a_process_hangs_when_it_is_silent_and_uses_no_cpu_time(pulse, now, hangs):
+    assert is_hung(pulse, now, LIMIT) is hangs
+
+
+def test_while_the_hub_is_silent_only_the_hub_is_judged():
+    silent = Pulse(0.0, heard=10.0)
+    fresh = Pulse(0.0, heard=99.5)
+
+    assert hung({"learner-0": silent, "actor-0": silent}, "learner-0", 100.0, LIMIT) == ["learner-0"]
+    assert hung({"learner-0": Pulse(0.0, 60.0), "actor-0": silent}, "learner-0", 100.0, LIMIT) == []
+    assert hung({"learner-0": fresh, "actor-0": silent}, "learner-0", 100.0, LIMIT) == ["actor-0"]
+    restarted = Pulse(80.0, heard=99.5)  # the actor could not be heard before
+    assert hung({"learner-0": restarted, "actor-0": silent}, "learner-0", 100.0, LIMIT) == []
+    assert hung({"learner-0": fresh, "actor-0": silent}, "learner-0", 100.0, 0.0) == []
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="needs /proc")
+def test_a_stopped_process_is_told_from_a_busy_one():
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    stopped = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        time.sleep(0.3)
+        stopped.send_signal(signal.SIGSTOP)
+        time.sleep(0.1)
+        watchdog = Watchdog("learner-0", 7.0)
+        processes = [("learner-0", os.getpid(), 0.0), ("busy", busy.pid, 0.0), ("stopped", stopped.pid, 0.0)]
+        heard = {"learner-0": 11.0}
+        watchdog.look(processes, heard, 6.0)
+        time.sleep(1.0)  # [s] of CPU time for the busy one; the watchdog's clock says 5.5
+        found = watchdog.look(processes, heard, 6.0 + LOOK_S + 0.5)
+    finally:
+        for process in (busy, stopped):
+            process.kill()
+            process.wait()
+
+    assert found == ["stopped"]
+    assert cpu_seconds(2**30) is None
