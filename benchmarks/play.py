@@ -13,6 +13,7 @@ from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
 from services.actor.player import Player
 from services.learner.curriculum import CurriculumConfig
+from services.learner.group import ALONE, Group
 from services.learner.ppo import PPOConfig
 from services.learner.training import Training
 
@@ -22,12 +23,14 @@ HORIZON = 32  # control steps of a rollout
 STAGE = 3  # the stage that a run spends most of its frames in
 
 
-def make_training(ppo: PPOConfig, seed: int) -> Training:
+def make_training(ppo: PPOConfig, seed: int, group: Group = ALONE) -> Training:
     """Return a new training of the default task and network."""
     task = TaskConfig()
     curriculum = CurriculumConfig(first_stage=STAGE)
     home = home_action(task.robot)
-    return Training(ppo, NetworkConfig(), curriculum, home, seed, observation=task.observation)
+    training = Training(ppo, NetworkConfig(), curriculum, home, seed, observation=task.observation)
+    training.group = group
+    return training
 
 
 def make_player(training: Training, envs: int, seed: int) -> Player:

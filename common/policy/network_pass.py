@@ -17,6 +17,9 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.elementwise import elu, elu_gradient, place
 
 Precision = Literal["float32", "bfloat16"]
+SIZE_STEP: Final = (
+    64  # rows of products whose batch is not a full one: each new shape costs a compilation of its product
+)
 DTYPES: Final[dict[Precision, torch.dtype]] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -47,7 +50,7 @@ class _Layer:
         self.hidden = linear.in_features - observed
         self.weights = torch.empty((linear.out_features, linear.in_features + 1), dtype=dtype)
         self.inputs = torch.ones((rows, linear.in_features + 1), dtype=dtype)
-        self.outputs = torch.empty((rows, linear.out_features), dtype=dtype)
+        self.outputs = torch.zeros((rows, linear.out_features), dtype=dtype)
         self.slope = torch.empty_like(self.outputs)  # of the loss, with respect to the outputs
         self.input_bits, self.output_bits, self.slope_bits = map(
             _bits, (self.inputs, self.outputs, self.slope)
@@ -104,6 +107,9 @@ class NetworkPass:
         self._critic = [layer(linear, 0 if k else beyond_trunk) for k, linear in enumerate(linears)]
         self._mean, self._value = layer(network.mean), layer(network.value)
         self._count = 0  # observations of the last forward pass
+        self._size = (
+            0  # rows of its products: the observations, and rows of earlier batches that nobody reads
+        )
         self.refresh()
 
     @torch.no_grad()
@@ -120,14 +126,15 @@ class NetworkPass:
             obs: The critic's observations, normalised (n, D), contiguous.
         """
         obs = obs.to(self.dtype)
-        self._count = count = len(obs)
+        count = len(obs)
         self._run_trunk(obs)
         chain = [*self._critic, self._value]
         for layer in chain:
             layer.take(obs)
         place(self._mean.input_bits[:count], self._mean.hidden, chain[0].input_bits, 0)
-        self._run(chain, count)
-        mean, value = self._mean.forward(count), self._value.forward(count).squeeze(-1)
+        self._run(chain, self._size)
+        mean, value = (layer.forward(self._size)[:count] for layer in (self._mean, self._value))
+        value = value.squeeze(-1)
         return mean.to(torch.float32, copy=True), value.to(torch.float32, copy=True)
 
     @torch.no_grad()
@@ -138,14 +145,16 @@ class NetworkPass:
             obs: The policy's observations, normalised (n, obs_size), contiguous.
         """
         self._run_trunk(obs.to(self.dtype))
-        return self._mean.forward(len(obs)).to(torch.float32, copy=True)
+        return self._mean.forward(self._size)[: len(obs)].to(torch.float32, copy=True)
 
     def _run_trunk(self, obs: Tensor) -> None:
         """Run the trunk, up to the inputs of ``mean``."""
+        self._count = count = len(obs)
+        self._size = min(-(-count // SIZE_STEP) * SIZE_STEP, self.rows)
         chain = [*self._trunk, self._mean]
         for layer in chain:
             layer.take(obs)
-        self._run(chain, len(obs))
+        self._run(chain, self._size)
 
     @staticmethod
     def _run(layers: list[_Layer], count: int) -> None:
@@ -168,17 +177,19 @@ class NetworkPass:
             mean: Slope of the loss with respect to the mean actions (n, A); None: only the critic's own layers learn.
             value: Slope with respect to the values (n,); None: 0.
         """
-        count = self._count
+        count, size = self._count, self._size
         self._value.slope[:count, 0] = 0.0 if value is None else value
-        slope = self._back([*self._critic, self._value], count, is_needed=mean is not None)
+        self._value.slope[count:size] = 0.0
+        slope = self._back([*self._critic, self._value], size, is_needed=mean is not None)
         if mean is None:
             return
         self._mean.slope[:count] = mean
-        self._mean.backward(count)
+        self._mean.slope[count:size] = 0.0
+        self._mean.backward(size)
         last = self._trunk[-1]
-        torch.add(slope, self._mean.hidden_slope(count), out=last.slope[:count])
-        elu_gradient(self._mean.input_bits, last.slope_bits[:count])
-        self._back(self._trunk, count, is_needed=False)
+        torch.add(slope, self._mean.hidden_slope(size), out=last.slope[:size])
+        elu_gradient(self._mean.input_bits, last.slope_bits[:size])
+        self._back(self._trunk, size, is_needed=False)
 
     def _back(self, layers: list[_Layer], count: int, is_needed: bool) -> Tensor:
         """Set the gradients of layers with ELU between them; return the slope of the first one's hidden inputs."""

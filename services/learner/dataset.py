@@ -14,8 +14,9 @@ from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.advantage import gae
-from services.learner.epoch_stats import PlayStats, play_stats
-from services.learner.ppo import Dataset, PPOConfig, denormalized, explained_variance
+from services.learner.epoch_stats import PlayStats, merged, play_counts
+from services.learner.group import ALONE, Group
+from services.learner.ppo import Dataset, PPOConfig, Share, denormalized, explained_variance
 
 Floats = npt.NDArray[np.float32]
 
@@ -29,6 +30,7 @@ class Model:
     value_moments: Moments
     obs_size: int
     ppo: PPOConfig
+    group: Group = ALONE
 
     def values(self, obs: Floats) -> Floats:
         """Return the critic's values [reward] of observations (N, D)."""
@@ -51,12 +53,13 @@ class Batch:
     """All that an epoch needs of its rollouts."""
 
     data: Dataset
+    share: Share  # which frames of the group's dataset they are
     explained: float  # explained variance of the values before the update
     value_moments: Moments  # after these returns
-    obs_moments: tuple[Moments, ...]  # of each rollout's raw observations
-    play: PlayStats
-    lag: float  # mean of (version now - version that played)
-    frames: int
+    obs_moments: tuple[Moments, ...]  # of each rollout's raw observations, over all ranks
+    play: PlayStats  # over all ranks
+    lag: float  # mean of (version now - version that played), over all ranks
+    frames: int  # over all ranks
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +86,8 @@ def read(
 ) -> Batch:
     """Return the update's data: normalised by the frozen moments, with pi_prox and the critic computed again.
 
+    In a group every rank reads its own rollouts, and statistics are those of all ranks' together.
+
     Args:
         rollouts: The dataset; blocks may differ in shape. Their order decides the result's bits.
         model: Network and moments before the update.
@@ -95,8 +100,14 @@ def read(
     for rollout in rollouts:
         parts.append(_part(rollout, model, distillation, log_std))
         on_tick()
-    values = np.concatenate([part.values for part in parts])
-    advantage = np.concatenate([part.advantages for part in parts])
+    group = model.group
+    own = np.stack(
+        [np.concatenate([getattr(part, name) for part in parts]) for name in ("values", "advantages")]
+    )
+    ranks = group.gathered(np.ascontiguousarray(own.T))
+    values, advantage = np.ascontiguousarray(np.concatenate(ranks).T)
+    first = sum(map(len, ranks[: group.rank]))
+    mine = slice(first, first + own.shape[1])
     target = advantage + values
     explained = explained_variance(target, values)
     moments = model.value_moments.merged(Moments.of(target))
@@ -110,19 +121,28 @@ def read(
         log_prox=torch.cat([part.log_prox for part in parts]),
         mean_prox=torch.cat([part.mean for part in parts]),
         log_std_prox=log_std,
-        advantages=torch.from_numpy(advantage),
-        value_targets=torch.from_numpy(((target - moments.mean) / scale).astype(np.float32)),
+        advantages=torch.from_numpy(advantage[mine]),
+        value_targets=torch.from_numpy(((target[mine] - moments.mean) / scale).astype(np.float32)),
         corrections=torch.cat([part.corrections for part in parts]),
     )
+    lags = np.array([float(version - rollout.version) for rollout in rollouts])
     return Batch(
         data=data,
+        share=Share(group, first, len(target)),
         explained=explained,
         value_moments=moments,
-        obs_moments=tuple(part.moments for part in parts),
-        play=play_stats(rollouts),
-        lag=float(np.mean([version - rollout.version for rollout in rollouts])),
-        frames=len(actions),
+        obs_moments=tuple(_gathered_moments([part.moments for part in parts], group)),
+        play=merged([counts[0] for counts in group.gathered(play_counts(rollouts)[None])]),
+        lag=float(np.mean(np.concatenate(group.gathered(lags)))),
+        frames=len(target),
     )
+
+
+def _gathered_moments(own: Sequence[Moments], group: Group) -> list[Moments]:
+    """Return the moments of every rank's rollouts, in the order of ranks."""
+    rows = np.array([[*moments.mean, *moments.var, moments.count] for moments in own])
+    size = (rows.shape[1] - 1) // 2
+    return [Moments(row[:size], row[size:-1], int(row[-1])) for rank in group.gathered(rows) for row in rank]
 
 
 @torch.no_grad()

@@ -81,6 +81,25 @@ class PlayStats:
         return _share(self.error_sum, self.returned)
 
 
+def merged(parts: Sequence[npt.NDArray[np.float64]]) -> PlayStats:
+    """Return the results of several datasets together, from each one's ``play_counts``."""
+    total = np.sum(parts, axis=0)
+    rallies, caught, over, returned, unvalidated = (int(count) for count in total[:5])
+    error_sum, return_sum, frames = (float(value) for value in total[5:8])
+    outcomes, terms = np.split(total[8:], [len(Outcome)])
+    return PlayStats(
+        rallies=rallies,
+        caught=caught,
+        over=over,
+        returned=returned,
+        error_sum=error_sum,
+        outcomes=outcomes.astype(np.int64),
+        unvalidated=unvalidated,
+        mean_return=_share(return_sum, rallies),
+        reward_terms=terms / frames,
+    )
+
+
 def _share(part: float, whole: int) -> float:
     return part / whole if whole else float("nan")
 
@@ -98,8 +117,8 @@ class EpochStats:
     frames: int
 
 
-def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
-    """Return the counts over the rallies that ended in ``rollouts``."""
+def play_counts(rollouts: Sequence[Rollout]) -> npt.NDArray[np.float64]:
+    """Return what ``merged`` takes: counts and sums over the rallies that ended in ``rollouts``, as one vector."""
     episodes = [rollout.episodes for rollout in rollouts]
     outcome = np.concatenate([e.outcome for e in episodes])
     rated = ~np.concatenate([e.unvalidated for e in episodes])
@@ -107,15 +126,18 @@ def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
     error = np.concatenate([e.target_error for e in episodes])
     returns = np.concatenate([e.returns for e in episodes])
     frames = sum(r.rewards.size for r in rollouts)
-    terms = np.sum([r.reward_terms.astype(np.float64) for r in rollouts], axis=0) / frames
-    return PlayStats(
-        rallies=int(rated.sum()),
-        caught=int((np.concatenate([e.caught for e in episodes]) & rated).sum()),
-        over=int((np.concatenate([e.over for e in episodes]) & rated).sum()),
-        returned=int(landed.sum()),
-        error_sum=float(error[landed].sum(dtype=np.float64)),
-        outcomes=np.bincount(outcome[rated], minlength=len(Outcome))[: len(Outcome)],
-        unvalidated=int((~rated).sum()),
-        mean_return=float(returns[rated].mean()) if rated.any() else float("nan"),
-        reward_terms=terms if terms.size else np.zeros(len(TERMS)),
+    terms = np.sum([r.reward_terms.astype(np.float64) for r in rollouts], axis=0)
+    return np.concatenate(
+        [
+            [rated.sum(), (np.concatenate([e.caught for e in episodes]) & rated).sum()],
+            [(np.concatenate([e.over for e in episodes]) & rated).sum(), landed.sum(), (~rated).sum()],
+            [error[landed].sum(dtype=np.float64), returns[rated].sum(dtype=np.float64), frames],
+            np.bincount(outcome[rated], minlength=len(Outcome))[: len(Outcome)],
+            terms if terms.size else np.zeros(len(TERMS)),
+        ]
     )
+
+
+def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
+    """Return the counts over the rallies that ended in ``rollouts``."""
+    return merged([play_counts(rollouts)])

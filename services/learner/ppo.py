@@ -25,6 +25,7 @@ from torch import Tensor
 from common.policy.actor_critic import entropy, kl_divergence, log_prob
 from common.policy.network_pass import NetworkPass, Precision, native_precision
 from common.policy.normalizer import Moments
+from services.learner.group import ALONE, Group
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
@@ -183,14 +184,58 @@ def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
     return 0.5 * ((mean - acted - corrections).square() * is_corrected).sum(-1).mean()
 
 
-def minibatches(data: Dataset, size: int, generator: torch.Generator) -> Iterator[Dataset]:
-    """Yield one pass over a dataset: its frames in random order, ``size`` at a time."""
-    count = len(data)
-    shuffled = data.taken(torch.randperm(count, generator=generator))
-    for start in range(0, count, size):
-        batch = shuffled.taken(slice(start, start + size))
-        if len(batch) >= min(size, count) // 2:  # a small remainder would weigh as much as a full batch
-            yield batch
+class Share(NamedTuple):
+    """Which frames of the group's dataset a rank has."""
+
+    group: Group
+    first: int  # index of its first frame
+    frames: int  # of the whole dataset
+
+
+def whole(data: Dataset) -> Share:
+    """Return the share of a learner alone: all of its dataset."""
+    return Share(ALONE, 0, len(data))
+
+
+def minibatches(
+    data: Dataset, size: int, generator: torch.Generator, share: Share
+) -> Iterator[tuple[Dataset, int]]:
+    """Yield one pass over the group's dataset: its frames in random order, ``size`` at a time.
+
+    Args:
+        data: This rank's frames.
+        size: Frames of a minibatch, over all ranks.
+        generator: In the same state on every rank.
+        share: Which frames of the whole dataset ``data`` are.
+
+    Yields:
+        This rank's frames of a minibatch, and how many the minibatch has over all ranks.
+    """
+    order = torch.randperm(share.frames, generator=generator)
+    is_own = (order >= share.first) & (order < share.first + len(data))
+    shuffled = data.taken(order[is_own] - share.first)
+    at = 0
+    for mine in torch.split(is_own, size):
+        count = int(mine.sum())
+        # a small remainder would weigh as much as a full batch
+        if len(mine) >= min(size, share.frames) // 2:
+            yield shuffled.taken(slice(at, at + count)), len(mine)
+        at += count
+
+
+def sum_gradients(parameters: list[torch.nn.Parameter], group: Group) -> None:
+    """Replace the parameters' gradients by their sums over the ranks: one message for all of them."""
+    if group.size == 1:
+        return
+    learning = [parameter for parameter in parameters if parameter.requires_grad]
+    for parameter in learning:
+        if parameter.grad is None:  # the minibatch has no frame of this rank
+            parameter.grad = torch.zeros_like(parameter)
+    gradients = [parameter.grad for parameter in learning if parameter.grad is not None]
+    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+    group.add(flat)
+    parts = torch.split(flat, [gradient.numel() for gradient in gradients])
+    torch._foreach_copy_(gradients, [p.view_as(g) for p, g in zip(parts, gradients, strict=True)])
 
 
 def bound_loss(mean: Tensor) -> Tensor:
@@ -270,6 +315,7 @@ def update(
     explained: float = 0.0,
     on_tick: Callable[[], None] = lambda: None,
     mode: UpdateMode = UpdateMode.PPO,
+    share: Share | None = None,
 ) -> UpdateStats:
     """Run the mini-epochs of one epoch. The network and ``optimizer`` are changed in place.
 
@@ -283,53 +329,68 @@ def update(
         explained: Explained variance of the values in the dataset; it is copied to the result.
         on_tick: Called between gradient steps.
         mode: What the policy learns from.
+        share: Which frames of the group's dataset ``data`` are; None: all of them.
     """
+    share = share or whole(data)
+    group = share.group
     network = network_pass.network
     parameters = list(network.parameters())
     learns = mode is not UpdateMode.CRITIC_ONLY
     for parameter in network.policy_parameters():
         parameter.requires_grad_(learns)  # a frozen one has no gradient, so that Adam does not change it
+    # Of this rank, until they are summed: sums over gradient steps, and log_prox - log_mu over frames
     sums = np.zeros(6)
-    is_corrected = config.correction_weight > 0 and learns and bool((data.corrections != 0.0).any())
+    about = torch.tensor([(data.log_prox - data.log_mu).exp().sum(), (data.corrections != 0.0).any()])
+    group.add(about)
+    is_corrected = config.correction_weight > 0 and learns and bool(about[1])
     learning_rate = rate.start
     steps, finite, kl = 0, True, 0.0
     for _ in range(config.mini_epochs):
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate
+        for settings in optimizer.param_groups:
+            settings["lr"] = learning_rate
         kl_sum, batches = 0.0, 0
-        for batch in minibatches(data, config.minibatch, generator):
-            mean, values = network_pass.forward(batch.obs)
-            mean.requires_grad_(learns)
-            values.requires_grad_()
-            losses = _losses(mean, values, network.log_std, batch, config, mode, is_corrected)
+        for batch, count in minibatches(data, config.minibatch, generator, share):
+            part = len(batch) / count  # 1 for a learner alone: losses are means over a rank's frames
             optimizer.zero_grad(set_to_none=True)
-            losses.total.backward()  # type: ignore[no-untyped-call]
-            network_pass.backward(mean.grad, values.grad)
+            if part:
+                mean, values = network_pass.forward(batch.obs)
+                mean.requires_grad_(learns)
+                values.requires_grad_()
+                losses = _losses(mean, values, network.log_std, batch, config, mode, is_corrected)
+                (part * losses.total).backward()  # type: ignore[no-untyped-call]
+                network_pass.backward(mean.grad, values.grad)
+            sum_gradients(parameters, group)
             norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm, foreach=True))
             if not np.isfinite(norm):
                 finite = False
                 continue
             optimizer.step()
             network_pass.refresh()
-            with torch.no_grad():
-                kl = float(kl_divergence(batch.mean_prox, batch.log_std_prox, mean, network.log_std))
-                outside = ((losses.log_new - batch.log_prox).exp() - 1.0).abs() > config.clip
-            sums += (
-                losses.policy.item(),
-                losses.value.item(),
-                losses.bound.item(),
-                outside.float().mean().item(),
-                norm,
-                losses.correction.item(),
-            )
-            on_tick()
-            kl_sum += kl
             steps, batches = steps + 1, batches + 1
-        kl = kl_sum / batches if batches else math.inf  # no step was finite: smaller ones are needed
+            if part:
+                with torch.no_grad():
+                    moved = kl_divergence(batch.mean_prox, batch.log_std_prox, mean, network.log_std)
+                    outside = ((losses.log_new - batch.log_prox).exp() - 1.0).abs() > config.clip
+                kl_sum += part * float(moved)
+                sums += part * np.array(
+                    (
+                        losses.policy.item(),
+                        losses.value.item(),
+                        losses.bound.item(),
+                        outside.float().mean().item(),
+                        norm,
+                        losses.correction.item(),
+                    )
+                )
+            on_tick()
+        total = torch.tensor([kl_sum], dtype=torch.float64)
+        group.add(total)
+        kl = float(total[0]) / batches if batches else math.inf  # no step was finite: smaller ones are needed
         if mode is UpdateMode.PPO and config.schedule == "adaptive":
             learning_rate = adapted_learning_rate(
                 learning_rate, kl, config.learning_rate_min, rate.highest, config.target_kl
             )
+    group.add(torch.from_numpy(sums))
     means = sums / max(steps, 1)
     return UpdateStats(
         policy_loss=float(means[0]),
@@ -339,7 +400,7 @@ def update(
         entropy=float(entropy(network.log_std.detach())),
         kl=kl,
         clip_fraction=float(means[3]),
-        weight=float((data.log_prox - data.log_mu).exp().mean()),
+        weight=float(about[0]) / share.frames,
         gradient_norm=float(means[4]),
         explained_variance=explained,
         learning_rate=learning_rate,

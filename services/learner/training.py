@@ -20,6 +20,7 @@ from services.learner.curriculum import CurriculumConfig, StageLengths, Trained,
 from services.learner.dataset import Batch, Distillation, Model, read
 from services.learner.divergence import DivergenceConfig, Health, divergence, running_mean, watched
 from services.learner.epoch_stats import EpochStats, Progress
+from services.learner.group import ALONE, Group
 from services.learner.ppo import LearningRate, PPOConfig, UpdateMode, update
 
 Floats = npt.NDArray[np.float32]
@@ -75,6 +76,8 @@ class Training:
         self.notice = notice
         self.divergence = divergence
         self.teacher = teacher
+        # The learners that train together: set before the first epoch. All are made with the same arguments.
+        self.group: Group = ALONE
         self.network_pass = NetworkPass(self.network, ppo.minibatch, ppo.products)
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True
@@ -139,6 +142,7 @@ class Training:
             batch.explained,
             on_tick,
             mode,
+            batch.share,
         )
         frozen = moments = self.obs_moments
         for part in batch.obs_moments:
@@ -188,7 +192,9 @@ class Training:
     def read(self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None) -> Batch:
         """Return the data of the next epoch from its rollouts; nothing is changed."""
         self.network_pass.refresh()
-        model = Model(self.network_pass, self.obs_moments, self.value_moments, self.obs_size, self.ppo)
+        model = Model(
+            self.network_pass, self.obs_moments, self.value_moments, self.obs_size, self.ppo, self.group
+        )
         distillation = Distillation(self.teacher, self.is_distilling)
         return read(rollouts, model, distillation, self.progress.version, on_tick)
 

@@ -10,7 +10,7 @@ import torch
 
 from common.policy.actor_critic import ActorCritic, NetworkConfig
 from common.policy.weights import new_network
-from services.learner.ppo import Dataset, LearningRate, PPOConfig, UpdateMode, minibatches
+from services.learner.ppo import Dataset, LearningRate, PPOConfig, UpdateMode, minibatches, whole
 from tests.unit.services.learner.test_ppo import make_data, update
 
 RATE = 1e-3
@@ -107,7 +107,7 @@ def test_mean_actions_beyond_the_joints_range_are_pulled_back_by_the_bound_weigh
 )
 def test_a_remainder_smaller_than_half_a_minibatch_is_left_out(frames, size, expected):
     data = make_data(new_network(NetworkConfig(units=(16,))), frames)
-    batches = list(minibatches(data, size, torch.Generator().manual_seed(0)))
+    batches = [batch for batch, _ in minibatches(data, size, torch.Generator().manual_seed(0), whole(data))]
 
     assert [len(batch) for batch in batches] == expected
 
@@ -116,7 +116,7 @@ def test_a_pass_takes_every_frame_once_with_all_that_belongs_to_it():
     data = make_data(new_network(NetworkConfig(units=(16,))), 96)
     number = torch.arange(96.0)
     numbered = replace(data, advantages=number, value_targets=-number)
-    batches = list(minibatches(numbered, 32, torch.Generator().manual_seed(0)))
+    batches = [batch for batch, _ in minibatches(numbered, 32, torch.Generator().manual_seed(0), whole(data))]
     order = torch.cat([batch.advantages for batch in batches])
 
     assert not torch.equal(order, number)

@@ -1,0 +1,118 @@
+"""A group of learners trains as one learner that has all the rollouts."""
+
+import multiprocessing
+import socket
+from multiprocessing.connection import Connection
+
+import numpy as np
+import pytest
+import torch
+
+from services.learner.curriculum import CurriculumConfig
+from services.learner.group import ALONE, Group, GroupError, join
+from services.learner.ppo import PPOConfig
+from services.learner.training import Training
+from tests.unit.services.learner.rollouts import make_rollout
+from tests.unit.services.learner.test_training import make_training
+
+ROLLOUTS = 4
+EPOCHS = 3
+# A stage change on the way: its first epochs train the critic alone
+CURRICULUM = CurriculumConfig(first_stage=1, stage_1=1, stage_2=0, stage_3=50)
+
+
+def trained(group: Group, ppo: PPOConfig) -> Training:
+    """Return a training after three epochs, of which this rank has had its share of the rollouts."""
+    training = make_training(ppo=ppo, curriculum=CURRICULUM)
+    training.group = group
+    each = ROLLOUTS // group.size
+    for epoch in range(EPOCHS):
+        # Rollouts of different sizes: a rank's share is not a fixed part of the dataset
+        rollouts = [make_rollout(seed=10 * epoch + k, envs=8 + 4 * k) for k in range(ROLLOUTS)]
+        training.run_epoch(rollouts[each * group.rank : each * (group.rank + 1)])
+    return training
+
+
+def outcome(training: Training) -> dict[str, np.ndarray]:
+    """Return all that an epoch changes."""
+    stats = training.progress
+    arrays = {name: value.detach().numpy() for name, value in training.network.state_dict().items()}
+    return arrays | {
+        "obs mean": training.obs_moments.mean,
+        "obs var": training.obs_moments.var,
+        "value mean": training.value_moments.mean,
+        "progress": np.array([stats.version, stats.frames, stats.stage, stats.epochs_in_stage]),
+        "learning rate": np.array(stats.learning_rate),
+        "catch rate": np.array(stats.catch_rate),
+    }
+
+
+def rank_main(rank: int, size: int, port: int, ppo: PPOConfig, results: Connection) -> None:
+    environment = {"RANK": str(rank), "WORLD_SIZE": str(size)}
+    import os
+
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    group = join(environment)
+    results.send(outcome(trained(group, ppo)))
+    group.leave()
+
+
+def train_together(size: int, ppo: PPOConfig) -> list[dict[str, np.ndarray]]:
+    """Return every rank's outcome."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    context = multiprocessing.get_context("spawn")
+    pipes = [context.Pipe(duplex=False) for _ in range(size)]
+    ranks = [
+        context.Process(target=rank_main, args=(rank, size, port, ppo, pipes[rank][1]))
+        for rank in range(size)
+    ]
+    for rank in ranks:
+        rank.start()
+    found = [receiver.recv() if receiver.poll(120) else {} for receiver, _ in pipes]
+    for rank in ranks:
+        rank.join(30)
+    return found
+
+
+@pytest.mark.parametrize("size", [2, 4])
+def test_ranks_reach_the_parameters_of_one_learner(size):
+    ppo = PPOConfig(minibatch=64, mini_epochs=2, precision="float32", correction_weight=5.0, refit_epochs=1)
+    alone = outcome(trained(ALONE, ppo))
+    ranks = train_together(size, ppo)
+
+    for rank in ranks:
+        assert rank.keys() == alone.keys()
+        for name, expected in alone.items():
+            np.testing.assert_allclose(rank[name], expected, rtol=0, atol=1e-6, err_msg=name)
+            np.testing.assert_array_equal(rank[name], ranks[0][name], err_msg=name)
+
+
+def test_minibatches_without_a_frame_of_a_rank_are_trained_by_the_others():
+    """32 frames of 8 x 16 to 20 x 16: in four ranks some minibatches have none of the smallest rollout."""
+    ppo = PPOConfig(minibatch=32, mini_epochs=4, precision="float32")
+    ranks = train_together(4, ppo)
+
+    expected = outcome(trained(ALONE, ppo))
+    for name, values in expected.items():
+        np.testing.assert_allclose(ranks[3][name], values, rtol=0, atol=1e-6, err_msg=name)
+
+
+def test_without_torchrun_a_learner_is_alone():
+    assert join({}) == ALONE
+    assert join({"RANK": "0", "WORLD_SIZE": "1"}) == ALONE
+
+
+@pytest.mark.parametrize("environment", [{"WORLD_SIZE": "2"}, {"WORLD_SIZE": "two", "RANK": "0"}])
+def test_an_incomplete_environment_is_refused(environment):
+    with pytest.raises(GroupError, match="allowed: two whole numbers, as torchrun sets them"):
+        join(environment)
+
+
+def test_alone_nothing_is_summed_or_copied():
+    values, array = torch.ones(3), np.arange(4.0)
+    ALONE.add(values)
+
+    assert values.tolist() == [1.0, 1.0, 1.0]
+    assert ALONE.gathered(array)[0] is array
