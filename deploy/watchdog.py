@@ -14,6 +14,9 @@ from typing import Final
 BUSY_SHARE: Final = 0.05  # [-] of a core: a process that waits uses less than 0.02
 LOOK_S: Final = 5.0  # between two measurements of the CPU time
 MOST_LIMITS: Final = 20.0  # a process that is busy and silent for so many limits hangs too
+OWN_GAP_S: Final = (
+    10.0  # between two looks: after a longer one the whole run was stopped (Ctrl-Z), and starts anew
+)
 HUB_FRESH_S: Final = 5.0  # silence of the hub after which the others are not judged
 
 
@@ -74,6 +77,8 @@ class Watchdog:
     cpu_of: Callable[[int], float | None] = cpu_seconds
     _marks: dict[int, tuple[float, float]] = field(default_factory=dict)  # time and CPU time, by process id
     _busy: dict[int, float] = field(default_factory=dict)
+    _looked: float | None = None  # time of the last look
+    _awake: float = 0.0  # since when it has looked without a gap
 
     def look(
         self, processes: Iterable[tuple[str, int, float]], heard: Mapping[str, float], now: float
@@ -85,10 +90,13 @@ class Watchdog:
             heard: Time of each one's last heartbeat.
             now: [s]
         """
+        if self._looked is not None and now - self._looked > OWN_GAP_S:
+            self._awake = now
+        self._looked = now
         pulses = {}
         for name, process, started in processes:
             self._measure(process, now)
-            pulses[name] = Pulse(started, heard.get(name), self._busy.get(process))
+            pulses[name] = Pulse(max(started, self._awake), heard.get(name), self._busy.get(process))
         return hung(pulses, self.hub, now, self.limit_s)
 
     def _measure(self, process: int, now: float) -> None:

@@ -44,6 +44,19 @@ def test_while_the_hub_is_silent_only_the_hub_is_judged():
     assert hung({"learner-0": fresh, "actor-0": silent}, "learner-0", 100.0, 0.0) == []
 
 
+def test_after_a_stop_of_the_whole_run_nobody_hangs_until_the_limit_has_passed_again():
+    """Ctrl-Z stops the watchdog too: when it goes on, all heartbeats are old."""
+    watchdog = Watchdog("learner-0", LIMIT, cpu_of=lambda _: 1.0)
+    processes = [("learner-0", 1, 0.0)]
+    heard = {"learner-0": 10.0}
+
+    assert watchdog.look(processes, heard, 11.0) == []
+    stopped_until = 500.0
+    looks = [watchdog.look(processes, heard, stopped_until + second) for second in range(60)]
+    assert looks == [[]] * 60
+    assert watchdog.look(processes, heard, stopped_until + 61.0) == ["learner-0"]
+
+
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="needs /proc")
 def test_a_stopped_process_is_told_from_a_busy_one():
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
