@@ -6,7 +6,6 @@ It starts a real learner, and senders that report as waiting actors do: each has
 plays. Several of them share a session, so the machine carries a thousand.
 """
 
-import json
 import shutil
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from threading import Event
 import psutil
 from pydantic import Field
 
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
 from common.comms.messages import ActorReport, PolicySnapshot, Verdict
@@ -27,6 +26,7 @@ from common.comms.transport import Flow, PendingReply, Reply, Transport
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
+from common.evaluation.evaluate import check
 from common.service.member import LEARNER_ID
 from common.service.process import DONE
 from deploy.prepare import free_endpoint
@@ -111,8 +111,7 @@ def measure(config: IdleConfig, endpoint: str, process: psutil.Process, stop: Ev
         def work(seconds: float) -> None:
             until = time.monotonic() + seconds
             while (now := time.monotonic()) < until:
-                if stop.is_set():
-                    raise ReportedError("stopped before it was done")
+                check(stop)
                 senders.step(now)
                 time.sleep(0.02)
 
@@ -147,10 +146,7 @@ def main(config: IdleConfig, stop: Event) -> int:
             learner.terminate()
             learner.wait(30.0)
     shutil.rmtree(folder, ignore_errors=True)
-    for key, value in result.items():
-        print(f"{key:>20} {value}", file=sys.stderr)
-    if config.json_line:
-        print(json.dumps(result))
+    print_figures(result, config.json_line)
     return DONE
 
 

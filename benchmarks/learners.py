@@ -10,7 +10,6 @@ are ranks. The group's parameters after three epochs, in float32, are compared w
 import json
 import multiprocessing
 import os
-import socket
 import sys
 import time
 from multiprocessing.connection import Connection
@@ -25,6 +24,7 @@ from benchmarks.play import make_player, make_training
 from benchmarks.settings import TimedConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import Rollout
+from deploy.prepare import free_port
 from services.learner.group import join
 from services.learner.ppo import PPOConfig
 
@@ -73,9 +73,7 @@ def train(size: int, payloads: list[bytes], ppo: PPOConfig, seconds: float) -> t
         ppo: Hyper-parameters.
         seconds: To measure; 0: train ``EPOCHS_COMPARED`` epochs.
     """
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     other, unused = context.Pipe(duplex=False)

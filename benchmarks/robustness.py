@@ -21,14 +21,13 @@ from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from common.evaluation.match import evaluation_rallies, match_task, play_match
-from common.evaluation.measures import MatchResult, wilson
+from common.evaluation.measures import MatchResult, measures
 from common.physics.constants import GRID_STEP
 from common.policy.box import policy_folder
 from common.policy.folder import Policy, load_policy
 from common.task.config import MatchConditions, TaskConfig
 from common.task.launch_presets import PresetName
 from common.task.randomization import MAX_LATENCY_STEPS, RandomizationProfile, profile_of
-from common.task.states import Outcome
 
 BALLS_EACH: Final = 10  # of an opponent
 LATENCIES_MS: Final = (0, 10, 20, 30, 40, 50, 60)
@@ -41,13 +40,8 @@ Row = dict[str, Any]
 
 def rate(result: MatchResult) -> Row:
     """Return the return rate and its 95 % interval."""
-    count = len(result.outcomes)
-    returned = int((result.outcomes == Outcome.RETURNED).sum())
-    return {
-        "rallies": count,
-        "return_rate": round(returned / max(count, 1), 4),
-        "return_rate_ci": [round(bound, 4) for bound in wilson(returned, count)],
-    }
+    found = measures(result)
+    return {name: found[name] for name in ("rallies", "return_rate", "return_rate_ci")}
 
 
 def conditions(launch: PresetName) -> list[tuple[str, str, dict[str, Any], int | None]]:

@@ -1,7 +1,8 @@
 """Settings that all benchmarks have, and how a benchmark is started."""
 
+import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from threading import Event
 from typing import Final, TypeVar
 
@@ -28,6 +29,15 @@ class TimedConfig(BenchmarkConfig):
         10.0, gt=0, description="duration of the measurement", json_schema_extra={"unit": "s"}
     )
     seed: int = Field(0, ge=0, lt=2**63, description="of all random numbers")
+
+
+def print_figures(figures: Mapping[str, object], as_json: bool) -> None:
+    """Print figures by name for a person, on stderr, and as one JSON line if it is asked for."""
+    width = max(map(len, figures))
+    for name, value in figures.items():
+        print(f"{name:>{width}} {value}", file=sys.stderr)
+    if as_json:
+        print(json.dumps(figures))
 
 
 _Config = TypeVar("_Config", bound=BenchmarkConfig)

@@ -5,7 +5,6 @@
 It starts a real run with the topology of `deploy.local`, lets it warm up, and measures it for a while.
 """
 
-import json
 import os
 import shutil
 import sys
@@ -16,12 +15,13 @@ from typing import Any
 import psutil
 from pydantic import Field
 
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.comms.codec import decode
 from common.comms.keys import Keys
 from common.comms.messages import Status
 from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
+from common.evaluation.evaluate import check
 from common.service.process import DONE
 from common.service.run_folder import LATEST, RUNS, whole_rows
 from deploy.config import DeployConfig
@@ -49,8 +49,7 @@ def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> 
         def watch(until: float) -> None:
             nonlocal learner
             while time.monotonic() < until:
-                if stop.is_set():
-                    raise ReportedError("stopped before it was done")
+                check(stop)
                 supervisor.watch(time.monotonic())
                 if supervisor.status_of("learner-0") is not None:
                     raise ReportedError(f"the learner ended early: see {folder.logs / 'learner-0.log'}")
@@ -124,10 +123,7 @@ def main(config: SystemConfig, stop: Event) -> int:
         shutil.rmtree(prepared_run.folder.root, ignore_errors=True)
         if not (RUNS / LATEST).exists():  # the link to the folder that is gone
             (RUNS / LATEST).unlink(missing_ok=True)
-    for key, value in result.items():
-        print(f"{key:>16} {value}", file=sys.stderr)
-    if config.json_line:
-        print(json.dumps(result))
+    print_figures(result, config.json_line)
     return DONE
 
 

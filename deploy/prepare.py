@@ -84,11 +84,16 @@ def metrics_ports(config: DeployConfig) -> list[int]:
     return [config.metrics_port + i if config.metrics_port else 0 for i in range(count)]
 
 
-def free_endpoint() -> str:
-    """Return a free endpoint on the loopback interface."""
+def free_port() -> int:
+    """Return a free port on the loopback interface."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return int(probe.getsockname()[1])
+
+
+def free_endpoint() -> str:
+    """Return a free endpoint on the loopback interface."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def settings(argv: Sequence[str], prog: str) -> DeployConfig:

@@ -14,9 +14,7 @@ from typing import Final
 BUSY_SHARE: Final = 0.05  # [-] of a core: a process that waits uses less than 0.02
 LOOK_S: Final = 5.0  # between two measurements of the CPU time
 MOST_LIMITS: Final = 20.0  # a process that is busy and silent for so many limits hangs too
-OWN_GAP_S: Final = (
-    10.0  # between two looks: after a longer one the whole run was stopped (Ctrl-Z), and starts anew
-)
+OWN_GAP_S: Final = 10.0  # between two looks: a longer one means that the whole run was stopped (Ctrl-Z)
 HUB_FRESH_S: Final = 5.0  # silence of the hub after which the others are not judged
 
 

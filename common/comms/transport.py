@@ -14,7 +14,7 @@ process) and ``zenoh_transport.py`` (processes and machines). They guarantee:
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from threading import Condition
@@ -246,6 +246,13 @@ class Server:
             self._inbox.wait(timeout_s)
         raw = self._inbox.take()
         return None if raw is None else self._read(raw)
+
+    def waiting(self, most: int) -> Iterator[Request]:
+        """Yield the requests that wait, oldest first, ``most`` at most: those that arrive meanwhile delay nobody."""
+        for _ in range(most):
+            if (request := self.poll()) is None:
+                return
+            yield request
 
     def close(self) -> None:
         """Stop serving. Requests that were not taken end with NO_SERVER, also those that arrive during this call."""

@@ -9,12 +9,11 @@ from pydantic import Field
 
 from common.env.rally_env import FinishedRallies, Launches, RallyEnv, RallySource
 from common.evaluation.measures import MatchResult
-from common.evaluation.opponents import OpponentRallies, in_equal_batches
+from common.evaluation.opponents import FILLED, FilledDeck, OpponentRallies, in_equal_batches
 from common.evaluation.robot_measures import RobotMonitor
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.policy.contract import Contract
 from common.policy.folder import Policy
-from common.rally.state import NO_SAMPLE
 from common.task.config import MatchConditions, PlayConditions, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import Purpose, RallyBlock, draw_rallies
@@ -68,28 +67,16 @@ class FixedRallies:
 
     def __init__(self, rallies: RallyBlock, filler: RallyBlock) -> None:
         self._rallies = rallies
-        self._filler = filler
+        self._deck = FilledDeck(rallies, filler)
         self._dealt = 0
-        self._filled = 0
 
     def take(self, rows: npt.NDArray[np.int64]) -> Launches:
         """Return the next launches, one for each of the environments ``rows`` (n,)."""
-        count = rows.size
-        fresh = min(count, len(self._rallies.seeds) - self._dealt)
-        dealt = slice(self._dealt, self._dealt + fresh)
-        extra = (self._filled + np.arange(count - fresh)) % len(self._filler.seeds)
+        fresh = min(rows.size, len(self._rallies.seeds) - self._dealt)
+        dealt = np.full(rows.size, FILLED)
+        dealt[:fresh] = self._dealt + np.arange(fresh)
         self._dealt += fresh
-        self._filled += count - fresh
-        paths = None
-        if self._rallies.paths is not None:  # filler rallies have no recorded track
-            paths = np.full((count, *self._rallies.paths.shape[1:]), NO_SAMPLE)
-            paths[:fresh] = self._rallies.paths[dealt]
-        return Launches(
-            np.concatenate((self._rallies.launches[dealt], self._filler.launches[extra])),
-            np.concatenate((self._rallies.seeds[dealt], self._filler.seeds[extra])),
-            np.arange(count) < fresh,
-            paths,
-        )
+        return self._deck.launches(dealt)
 
 
 def evaluation_rallies(count: int, task: TaskConfig, seed: int) -> RallyBlock:
@@ -185,16 +172,15 @@ def play_match(
         arrivals=arrivals,
         robot=monitor.record(),
     )
-    return played if opponents is None else played.of(_in_order(seeds, rallies))
+    return played if opponents is None else played.of(np.argsort(_rows_of(seeds, rallies)))
 
 
-def _in_order(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.int64]:
-    """Return the rows of ``seeds`` (n,) in the order of ``rallies``."""
+def _rows_of(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.int64]:
+    """Return which row of ``rallies`` each of these seeds (n,) is; it must hold all of them."""
     order = np.argsort(rallies.seeds)
-    return np.argsort(order[np.searchsorted(rallies.seeds, seeds, sorter=order)])
+    return order[np.searchsorted(rallies.seeds, seeds, sorter=order)]
 
 
 def launches_of(seeds: npt.NDArray[np.uint64], rallies: RallyBlock) -> npt.NDArray[np.float64]:
     """Return the launches (n, 12) of the rallies with these seeds (n,), all of which ``rallies`` must hold."""
-    order = np.argsort(rallies.seeds)
-    return rallies.launches[order[np.searchsorted(rallies.seeds, seeds, sorter=order)]]
+    return rallies.launches[_rows_of(seeds, rallies)]

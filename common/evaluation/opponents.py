@@ -12,8 +12,41 @@ from common.task.launch import RallyBlock
 
 Floats = npt.NDArray[np.float32]
 Integers = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 EQUAL_BATCH = 64  # rows; a batch's size changes the last bits of a network's output, and so the rallies
+
+
+FILLED = -1  # in place of a rally's number: a filler rally
+
+
+class FilledDeck:
+    """The launches of chosen rallies, with filler rallies, which are not validated, where none is chosen.
+
+    Args:
+        rallies: The n rallies.
+        filler: Rallies for environments that have nothing else to play, used in turn.
+    """
+
+    def __init__(self, rallies: RallyBlock, filler: RallyBlock) -> None:
+        self._rallies, self._filler = rallies, filler
+        self._filled = 0
+
+    def launches(self, dealt: Integers, strangers: Flags | None = None) -> Launches:
+        """Return the launches of rallies ``dealt`` (m,), numbers or ``FILLED``; ``strangers`` as for `Launches`."""
+        is_fresh = dealt != FILLED
+        fresh = dealt[is_fresh]
+        extra = (self._filled + np.arange(len(dealt) - len(fresh))) % len(self._filler.seeds)
+        self._filled += len(extra)
+        launches = np.empty((len(dealt), self._rallies.launches.shape[1]))
+        seeds = np.empty(len(dealt), np.uint64)
+        launches[is_fresh], seeds[is_fresh] = self._rallies.launches[fresh], self._rallies.seeds[fresh]
+        launches[~is_fresh], seeds[~is_fresh] = self._filler.launches[extra], self._filler.seeds[extra]
+        paths = None
+        if self._rallies.paths is not None:  # filler rallies have no recorded track
+            paths = np.full((len(dealt), *self._rallies.paths.shape[1:]), NO_SAMPLE)
+            paths[is_fresh] = self._rallies.paths[fresh]
+        return Launches(launches, seeds, is_fresh, paths, strangers)
 
 
 class OpponentRallies:
@@ -28,7 +61,7 @@ class OpponentRallies:
     """
 
     def __init__(self, rallies: RallyBlock, opponents: Integers, filler: RallyBlock) -> None:
-        self._rallies, self._filler = rallies, filler
+        self._deck = FilledDeck(rallies, filler)
         # those with most balls first: the match takes as long as the last one
         numbers, counts = np.unique(opponents, return_counts=True)
         self._waiting = deque(
@@ -36,12 +69,11 @@ class OpponentRallies:
             for number in numbers[np.argsort(-counts, kind="stable")]
         )
         self._playing: dict[int, deque[int]] = {}
-        self._filled = 0
 
     def take(self, rows: Integers) -> Launches:
         """Return the next launches, one for each of the environments ``rows`` (n,)."""
         count = rows.size
-        dealt, strangers = np.full(count, -1, np.int64), np.ones(count, np.bool_)
+        dealt, strangers = np.full(count, FILLED), np.ones(count, np.bool_)
         for k, row in enumerate(rows.tolist()):
             if self._playing.get(row):
                 strangers[k] = False
@@ -50,20 +82,7 @@ class OpponentRallies:
             else:
                 continue
             dealt[k] = self._playing[row].popleft()
-        fresh = dealt >= 0
-        extra = (self._filled + np.arange(count - fresh.sum())) % len(self._filler.seeds)
-        self._filled += len(extra)
-        launches, seeds = np.empty((count, self._rallies.launches.shape[1])), np.empty(count, np.uint64)
-        launches[fresh], seeds[fresh] = (
-            self._rallies.launches[dealt[fresh]],
-            self._rallies.seeds[dealt[fresh]],
-        )
-        launches[~fresh], seeds[~fresh] = self._filler.launches[extra], self._filler.seeds[extra]
-        paths = None
-        if self._rallies.paths is not None:  # filler rallies have no recorded track
-            paths = np.full((count, *self._rallies.paths.shape[1:]), NO_SAMPLE)
-            paths[fresh] = self._rallies.paths[dealt[fresh]]
-        return Launches(launches, seeds, fresh, paths, strangers)
+        return self._deck.launches(dealt, strangers)
 
 
 def in_equal_batches(act: Callable[[Floats], Floats]) -> Callable[[Floats], Floats]:

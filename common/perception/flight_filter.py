@@ -323,7 +323,7 @@ def predict_interception(track: Array, now: float) -> None:
     there, then = here, speed
     spin = ball.spin
     if track[BOUNCED] == 0.0:
-        until = 0.0
+        until, ratio = 0.0, track[SPIN_RATIO]
         # A serve has another bounce before the one on the robot's court
         for bounces_left in range(2 if track[IS_SERVED] == 1.0 else 1, 0, -1):
             wait, there, then = fly_to_table(ball)
@@ -335,14 +335,13 @@ def predict_interception(track: Array, now: float) -> None:
             falling = (then[0], then[1], min(then[2], -0.1))
             rising, spin = table_bounce(
                 falling,
-                # After the first bounce of a serve the spin is the law's, and not what a flight shows of it
-                scale(track[SPIN_RATIO], ball.spin) if until == 0.0 else ball.spin,
+                scale(ratio, ball.spin),
                 (0.0, 0.0, 1.0),
                 TABLE_RESTITUTION0_MEAN,
                 TABLE_FRICTION_MEAN,
             )
             ball = BallEstimate(there, rising, spin, ball.drag_factor)
-            until += wait
+            until, ratio = until + wait, 1.0  # then the spin is the law's, and not what a flight shows of it
             if bounces_left == 1:
                 if ahead >= until:
                     here, speed = fly(ball, ahead - until)

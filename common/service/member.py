@@ -108,9 +108,7 @@ class Member:
             report: Answers an actor's report; None where actors do not report to this service.
         """
         allowed = (Control,) if report is None else (ActorReport, Control)
-        for _ in range(CONTROL_MAILBOX):
-            if (request := self._control.poll()) is None:
-                break
+        for request in self._control.waiting(CONTROL_MAILBOX):
             try:
                 message = decode_one_of(request.payload, allowed)
             except DecodeError as error:

@@ -73,15 +73,15 @@ class Balls(NamedTuple):
     velocity: tuple[Curve, Curve, Curve]
     # [rad/s] of a stroke: topspin, sidespin (about z), corkscrew (about the horizontal direction of flight)
     spin: tuple[Curve, Curve, Curve]
-    spin_radius: float  # [rad/s] otherwise the spin is uniform in a ball of this radius; 0: it is a stroke
     factor: Array  # of a stroke: ``score_factor``
-    speed_range: tuple[float, float]  # [m/s] a faster or slower stroke is not of this kind
-    least_spin: float  # [rad/s] a stroke with less spin is not of this kind
+    spin_radius: float = (
+        0.0  # [rad/s] otherwise the spin is uniform in a ball of this radius; 0: it is a stroke
+    )
+    speed_range: tuple[float, float] = (0.0, math.inf)  # [m/s] a faster or slower stroke is not of this kind
+    least_spin: float = 0.0  # [rad/s] a stroke with less spin is not of this kind
 
 
 _UNUSED: Final = (flat(0.0, 0.0),) * 3
-_ANY_SPEED: Final = (0.0, math.inf)
-_INDEPENDENT: Final = np.eye(len(QUANTITIES))
 
 
 def _box(spin_radius: float) -> Balls:
@@ -90,10 +90,8 @@ def _box(spin_radius: float) -> Balls:
         position=(flat(0.025, 1.35), flat(-0.74, 0.74), flat(0.02, 0.84)),
         velocity=(flat(-8.0, -3.0), flat(-4.0, 4.0), flat(-1.0, 1.0)),
         spin=_UNUSED,
+        factor=score_factor({}),
         spin_radius=spin_radius,
-        factor=_INDEPENDENT,
-        speed_range=_ANY_SPEED,
-        least_spin=0.0,
     )
 
 
@@ -118,7 +116,6 @@ _MATCH: Final = Balls(
         (-212.0, -127.0, -32.0, 26.0, 94.0, 227.0, 361.0),
         (-148.0, -90.0, -25.5, 0.8, 27.0, 94.0, 189.0),
     ),
-    spin_radius=0.0,
     factor=score_factor(
         {
             ("speed", "x"): 0.341,
@@ -134,8 +131,6 @@ _MATCH: Final = Balls(
             ("x", "elevation"): -0.289,
         }
     ),
-    speed_range=_ANY_SPEED,
-    least_spin=0.0,
 )
 
 # 1,352 recorded serves of players of all levels (D'Ambrosio et al. 2025): place, speed, direction and correlations are
@@ -156,7 +151,6 @@ _SERVE: Final = Balls(
         (-140.0, -97.0, -43.0, -10.0, 16.0, 81.0, 120.0),
         (-140.0, -73.0, -19.0, 2.0, 27.0, 80.0, 150.0),
     ),
-    spin_radius=0.0,
     factor=score_factor(
         {
             ("y", "azimuth"): -0.79,
@@ -168,8 +162,6 @@ _SERVE: Final = Balls(
             ("sidespin", "corkscrew"): -0.47,
         }
     ),
-    speed_range=_ANY_SPEED,
-    least_spin=0.0,
 )
 
 KINDS: Final[tuple[Balls, ...]] = (

@@ -27,9 +27,7 @@ from services.actor.rally_feed import RallyFeed, StopRequested
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.05
-REPORT_INTERVAL_S = (
-    0.25  # while without credits, until the learner sets another: a lost grant is repeated then
-)
+REPORT_INTERVAL_S = 0.25  # while without credits, until the learner sets another: a lost grant is repeated
 ASK_AGAIN_S = 1.0  # pause between requests for the policy
 LAST_VERDICTS_S = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S = 2.0

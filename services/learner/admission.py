@@ -46,6 +46,11 @@ class Header:
     training_hash: str
     fault: str = ""
 
+    @property
+    def life(self) -> tuple[str, int]:
+        """The actor, and which of its lives."""
+        return self.actor, self.incarnation
+
 
 @dataclass(frozen=True, slots=True)
 class Case:

@@ -88,13 +88,9 @@ class Broadcast:
 
     def answer(self) -> None:
         """Answer the requests that wait, a bounded number at a time."""
-        for _ in range(ANSWERED_AT_ONCE):
-            if (request := self._policies.poll()) is None:
-                break
+        for request in self._policies.waiting(ANSWERED_AT_ONCE):
             request.reply(self._averaged() if request.payload == AVERAGE else self._blob)
-        for _ in range(ANSWERED_AT_ONCE):
-            if (request := self._stage_log.poll()) is None:
-                break
+        for request in self._stage_log.waiting(ANSWERED_AT_ONCE):
             request.reply(encode(StageLog(tuple(self.stages))))
 
     def _averaged(self) -> bytes:

@@ -38,9 +38,7 @@ FOLD_LAST_AFTER_S: Final = 86_400.0  # the last life of an actor: by then it has
 MOST_ACCOUNTS: Final = 16_384  # a new one beyond closes a dead one early, or is refused
 LIVES_KEPT: Final = 4096  # closed lives whose late messages are told from those of new ones
 
-LONGEST_JUMP: Final = (
-    65_536  # of the numbers of a life that is known: far more than any window or outage takes
-)
+LONGEST_JUMP: Final = 65_536  # of the numbers of a known life: far more than any window or outage takes
 
 EARLIER: Final = ("", 0)  # the account of all closed lives
 
@@ -133,7 +131,7 @@ class Intake:
         self._queue: deque[Queued] = deque(queue)
         kept: dict[_Key, set[int]] = {}
         for entry in self._queue:
-            kept.setdefault((entry.header.actor, entry.header.incarnation), set()).add(entry.header.sequence)
+            kept.setdefault(entry.header.life, set()).add(entry.header.sequence)
         self._accounts: dict[_Key, Account] = {}
         self._in_update: tuple[Queued, ...] = ()
         self._now = 0.0
@@ -221,11 +219,10 @@ class Intake:
             max_lag=self._config.max_lag,
         )
         kind, reason = judge(case)
-        if (
-            kind is VerdictKind.WRONG_RUN
-        ):  # an actor of another run may have the name of one of ours: no account here
+        if kind is VerdictKind.WRONG_RUN:
+            # An actor of another run may have the name of one of ours: no account here
             return self._verdict(kind, kind, reason)
-        key = (header.actor, header.incarnation)
+        key = header.life
         if self._is_closed(key):
             return self._verdict(VerdictKind.INVALID, VerdictKind.INVALID, _closed_reason(key))
         if fault := self._jump_fault(key, header.sequence) or self._no_room(key):
@@ -436,17 +433,21 @@ class Intake:
 
     def _note_contract(self, key: _Key, account: Account, training_hash: str) -> None:
         """Remember what the actor plays; another task, network or experience is a misfit."""
-        is_new = training_hash != account.training_hash
         account.training_hash = training_hash
-        if training_hash == self._learner_state.training_hash or not account.is_alive:
+        if self._fits(account) or not account.is_alive:
             self._misfits.pop(key, None)
-        elif is_new or key not in self._misfits:
-            if key not in self._misfits:
-                self._new_misfits.append(Misfit(*key, training_hash))
-            self._misfits[key] = Misfit(*key, training_hash)
+            return
+        misfit = Misfit(*key, training_hash)
+        if key not in self._misfits:
+            self._new_misfits.append(misfit)
+        self._misfits[key] = misfit
+
+    def _fits(self, account: Account) -> bool:
+        """Return whether the actor has the learner's contract."""
+        return account.training_hash == self._learner_state.training_hash
 
     def _settle(self, entry: Queued, fate: Outcome) -> None:
-        key = (entry.header.actor, entry.header.incarnation)
+        key = entry.header.life
         self._changed.add(key)
         self._accounts[key].settle(entry.header.sequence, fate)
 
@@ -476,7 +477,7 @@ class Intake:
         return self._learner_state.version + datasets_before
 
     def _known(self, header: Header) -> Outcome | None:
-        account = self._accounts.get((header.actor, header.incarnation))
+        account = self._accounts.get(header.life)
         return None if account is None else account.outcome(header.sequence)
 
     def _verdict(self, kind: VerdictKind, first: VerdictKind, reason: str, credit_limit: int = 0) -> Verdict:
@@ -499,8 +500,7 @@ class Intake:
     def _grant(self, key: _Key, account: Account) -> None:
         """Raise the actor's limit as far as data is needed and its window allows."""
         self._recount(key, account)
-        fits = account.training_hash == self._learner_state.training_hash
-        if not (account.is_alive and fits) or self._now < account.no_credits_before:
+        if not (account.is_alive and self._fits(account)) or self._now < account.no_credits_before:
             return
         granted = min(self._wanted(), self._config.window - _outstanding(account))
         if granted > 0:
@@ -516,9 +516,8 @@ class Intake:
     def _recount(self, key: _Key, account: Account) -> None:
         """Bring the actor's part of the promised rollouts up to date."""
         is_fresh = self._now - account.last_progress < self._config.credit_patience_s
-        fits = account.training_hash == self._learner_state.training_hash
         part = 0
-        if account.is_alive and fits and is_fresh:
+        if account.is_alive and self._fits(account) and is_fresh:
             part = min(_outstanding(account), self._config.window)
         self._promised += part - self._holders.get(key, 0)
         if part:
@@ -541,9 +540,9 @@ class Intake:
 
 def pause_after(refusals: int) -> float:
     """Return how long an actor gets no credits after so many refusals in a row [s]."""
-    return (
-        0.0 if refusals <= FREE_REFUSALS else min(2.0 ** min(refusals - FREE_REFUSALS, 32), LONGEST_PAUSE_S)
-    )
+    if refusals <= FREE_REFUSALS:
+        return 0.0
+    return min(2.0 ** min(refusals - FREE_REFUSALS, 32), LONGEST_PAUSE_S)
 
 
 def _outstanding(account: Account) -> int:

@@ -380,10 +380,7 @@ class LearnerService:
                 f"actor={misfit.actor} has training {misfit.training_hash or 'of an older release'}; allowed: "
                 f"{self._training_hash}: it gets no credits until [task], [network] and [experience] are the learner's",
             )
-        for _ in range(SERVED_AT_ONCE):
-            request = self._rollouts.poll()
-            if request is None:
-                break
+        for request in self._rollouts.waiting(SERVED_AT_ONCE):
             self._metrics.inc("topspin_bytes_received_total", len(request.payload))
             opened = open_rollout(
                 request.payload, self._config.max_message_mib * 2**20, self.training.obs_size

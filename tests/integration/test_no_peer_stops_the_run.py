@@ -24,6 +24,15 @@ def trains_on(learner, epochs=4):
     wait_until(lambda: progress(learner).epoch >= epoch + epochs, 60, "training to go on")
 
 
+def started(s):
+    """Return a learner that trains, its only actor, and a peer of theirs."""
+    learner = s.learner()
+    s.generator()
+    actor = s.actor(0)
+    trains_on(learner, 2)
+    return learner, actor, s.peer()
+
+
 def newest_policy(peer):
     return decode(peer.request(KEYS.policy(), b"", 5.0, Flow.POLICY).wait().payload, PolicySnapshot)
 
@@ -68,11 +77,7 @@ def test_credits_of_an_actor_that_reports_and_never_plays_go_to_others(tmp_path)
 
 def test_a_forged_policy_of_a_higher_generation_is_ignored(tmp_path):
     with local_run(tmp_path, **ONE) as s:
-        learner = s.learner()
-        s.generator()
-        actor = s.actor(0)
-        trains_on(learner, 2)
-        peer = s.peer()
+        learner, actor, peer = started(s)
         forged = dataclasses.replace(newest_policy(peer), generation=2**62, version=2**61)
         for _ in range(5):
             peer.publish(KEYS.policy(), encode(forged), Flow.POLICY)
@@ -86,11 +91,7 @@ def test_a_forged_policy_of_a_higher_generation_is_ignored(tmp_path):
 
 def test_an_actor_comes_back_from_a_forged_version_of_its_own_learner(tmp_path, caplog):
     with local_run(tmp_path, **ONE) as s:
-        learner = s.learner()
-        s.generator()
-        actor = s.actor(0)
-        trains_on(learner, 2)
-        peer = s.peer()
+        learner, actor, peer = started(s)
 
         def forge():
             forged = dataclasses.replace(newest_policy(peer), version=2**61)

@@ -37,14 +37,12 @@ STEPS: Final = 360  # of each chain
 WARM_UP: Final = 110  # of them, which are not used
 COOLING: Final = 50  # first steps, in which the likelihood counts less
 COLD: Final = (
-    12.0  # [-] in the warm-up a chain this far below the best in log density restarts from a better one
+    12.0  # [-] in the warm-up a chain so far below the best in log density restarts from a better one
 )
 LONG_JUMP: Final = 7  # every so many steps proposals reach other modes
 INNER_STEPS: Final = 1  # of Newton's method
 FARTHEST: Final = 1e6  # [sigma] a larger residual counts as this
-TYPICAL: Final = (
-    6.0  # [-] twice the log likelihood: a launch this far below the best does not explain the track
-)
+TYPICAL: Final = 6.0  # [-] twice the log likelihood: a launch so far below the best explains no track
 _SAMPLED: Final = np.array([*range(SPIN.start, SPIN.stop), LIFT_FACTOR])
 
 

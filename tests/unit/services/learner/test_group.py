@@ -1,7 +1,6 @@
 """A group of learners trains as one learner that has all the rollouts."""
 
 import multiprocessing
-import socket
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 
 from common.policy.actor_critic import NetworkConfig
 from common.policy.weights import new_network
+from deploy.prepare import free_port
 from services.learner.curriculum import CurriculumConfig
 from services.learner.group import ALONE, Group, GroupError, join
 from services.learner.ppo import PPOConfig, Share, minibatches
@@ -62,9 +62,7 @@ def rank_main(rank: int, size: int, port: int, ppo: PPOConfig, results: Connecti
 
 def train_together(size: int, ppo: PPOConfig) -> list[dict[str, np.ndarray]]:
     """Return every rank's outcome."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     context = multiprocessing.get_context("spawn")
     pipes = [context.Pipe(duplex=False) for _ in range(size)]
     ranks = [
