@@ -3,13 +3,13 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from threading import Event
 from typing import Final
 
 from common.comms.codec import encode
-from common.comms.messages import ActorReport, Rollout, StageChange, Verdict
+from common.comms.messages import ActorReport, StageChange, Verdict
 from common.comms.transport import Transport
 from common.comms.zenoh_config import endpoint_for_others
 from common.env.robot import home_action
@@ -18,6 +18,7 @@ from common.errors import ReportedError
 from common.policy.contract import Contract, contract_hash, contract_of, training_hash
 from common.policy.folder import save_policy
 from common.service.config import save_settings, to_tables
+from common.service.history import History
 from common.service.member import LEARNER_ID, Member
 from common.service.metrics import Metrics
 from common.service.run_folder import RunFolder
@@ -48,6 +49,10 @@ class RunExistsError(ReportedError):
 
 class LearnerAliveError(ReportedError):
     """The run has another learner."""
+
+
+class NotSavedError(ReportedError):
+    """The run folder can't be written."""
 
 
 class DivergedError(ReportedError):
@@ -142,6 +147,8 @@ class LearnerService:
         self._joined = clock()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
+        self._history = History(config.history, "learner-0")
+        self._history.note("start", **self._where(), waiting=_lives(self._intake.waiting))
 
     # ---- state
 
@@ -203,6 +210,8 @@ class LearnerService:
             self._beat()
             self._run_log.close()
             self._member.leave()
+            self._history.note("end", trained=self.ledger().trained, balance=self.ledger().balance)
+            self._history.close()
         progress = self.training.progress
         log.info("stopped epoch=%d frames=%d stage=%d", progress.epoch, progress.frames, progress.stage)
 
@@ -214,7 +223,7 @@ class LearnerService:
         if dataset:
             # by number, not by arrival, so that a run with one actor is the same bit for bit on any network
             ordered = sorted(dataset, key=lambda entry: (entry.header.actor, entry.header.sequence))
-            self._train([entry.rollout for entry in ordered])
+            self._train(ordered)
             trained = True
         now = self._clock()
         if not trained:
@@ -230,9 +239,24 @@ class LearnerService:
     def save(self, is_last: bool = False) -> None:
         """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
 
+        Where that fails, such as on a full disk, training goes on, and the next one is tried in its time.
+
         Args:
             is_last: Whether this process trains no more. Then the checkpoint also keeps the rollouts that wait.
+
+        Raises:
+            NotSavedError: The last state can't be saved.
         """
+        try:
+            self._save(is_last)
+        except OSError as error:
+            self._metrics.inc("topspin_failed_saves_total")
+            text = f"epoch {self.training.progress.epoch} can't be saved in {self._folder.root}: {error.strerror}"
+            if is_last:
+                raise NotSavedError(f"{text}; what an earlier checkpoint holds is kept") from None
+            log.error("%s; training goes on, next try in %.0f s", text, self._config.checkpoint_interval_s)
+
+    def _save(self, is_last: bool) -> None:
         if not self.training.is_finite:
             log.error("not saved: parameters are not finite epoch=%d", self.training.progress.epoch)
             return
@@ -251,14 +275,15 @@ class LearnerService:
         weights = self.training.weights(self._config.evaluated_weights)
         save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
+        self._history.note("saved", **self._where(), waiting=_lives(self._intake.waiting) if is_last else [])
         log.debug("checkpoint written file=%s", path)
 
     # ---- training
 
-    def _train(self, rollouts: Sequence[Rollout]) -> None:
+    def _train(self, dataset: Sequence[Queued]) -> None:
         self._member.state = "training"
         started = self._clock()
-        stats = self.training.run_epoch(rollouts, self._serve)
+        stats = self.training.run_epoch([entry.rollout for entry in dataset], self._serve)
         clocks, now = self._clocks, self._clock()
         if clocks.first_trained < 0:
             clocks.first_trained = now
@@ -267,7 +292,8 @@ class LearnerService:
             self._broadcast.note_stage("curriculum")
         if stats.diverged:
             self._go_back(stats.diverged)
-        self._intake.finish_update(self._learner_state())
+        lost = self._intake.finish_update(self._learner_state())
+        self._history.note("trained", **self._where(), rollouts=_lives(dataset), lost=_lives(lost))
         self._broadcast.publish_policy()
         if stats.stage_changed:
             self._broadcast.publish_stage()
@@ -299,6 +325,16 @@ class LearnerService:
         self.training.go_back(lambda training: checkpoint.restore(path, training))
         self._metrics.inc("topspin_rollbacks_total")
         log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
+
+    def _where(self) -> dict[str, int]:
+        """Return what the history says of the training with each event."""
+        progress = self.training.progress
+        return {
+            "generation": self._generation,
+            "version": progress.version,
+            "epoch": progress.epoch,
+            "stage_number": progress.stage_number,
+        }
 
     def _learner_state(self) -> LearnerState:
         progress = self.training.progress
@@ -390,6 +426,12 @@ class LearnerService:
                 verdict = self._intake.unreadable("not readable as a rollout of this release")
             else:
                 verdict = self._intake.arrive(*opened, now)
+                self._history.note(
+                    "verdict",
+                    rollout=[*opened[0].life, opened[0].sequence],
+                    kind=verdict.kind.value,
+                    generation=self._generation,
+                )
                 if opened[0].fault:
                     self._member.refuse("rollout", f"actor={opened[0].actor} {opened[0].fault}")
             self._metrics.inc("topspin_rollouts_received_total", 1.0, verdict=verdict.kind.value)
@@ -486,3 +528,8 @@ class LearnerService:
             self._last | {"misfits": len(self._intake.misfits)},
         )
         self._member.beat(counters, gauges)
+
+
+def _lives(entries: Iterable[Queued]) -> list[tuple[str, int, int]]:
+    """Return the name of each rollout in a history: actor, incarnation, number."""
+    return [(*entry.header.life, entry.header.sequence) for entry in entries]
