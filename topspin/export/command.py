@@ -59,20 +59,15 @@ def main(argv: Sequence[str], _stop: Event) -> int:
     check_free(out)
     source = policy_folder(config.policy)
     policy = load_policy(source)
-    name = source.name if source.name not in ("latest", "best") else policy.contract.run
+    name = policy.contract.run if source.name in ("", "latest", "best") else source.name
     contract, parity = export_policy(policy, name, out, config.expected_spin)
-    found = {
-        "out": str(out),
-        "policy": contract.policy,
-        "robot": contract.robot,
-        "files": sorted(path.name for path in out.iterdir()),
-        "parity_max": parity,
-    }
+    files = sorted(path.name for path in out.iterdir())
     if config.json_line:
+        found = {"out": str(out), "policy": name, "robot": contract.robot, "files": files, "parity_max": parity}
         sys.stdout.write(json.dumps(found) + "\n")
     else:
         sys.stdout.write(
-            f"policy {name} for robot {contract.robot} is in {out}: {', '.join(found['files'])}\n"
+            f"policy {name} for robot {contract.robot} is in {out}: {', '.join(files)}\n"
             f"its actions in ONNX Runtime differ from the policy's by at most {parity:.1e}\n"
             f"next: pip install {out}/*.whl; python -m topspin_robot {out}\n"
         )

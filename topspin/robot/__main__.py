@@ -23,7 +23,7 @@ def time_steps(
     """Return the times [s] that ``steps`` control steps took by ``clock``, with made-up balls at the camera's rate."""
     period, home = controller.contract.period, controller.contract.of_joints("home")
     taken: list[float] = []
-    start = 1.0
+    start = max(controller.now, 0.0) + 2.0 * BALL_S
     while len(taken) < steps:
         controller.begin((0.9, 0.0))
         pictures = list(detections(BALL_S))
@@ -41,7 +41,7 @@ def time_steps(
 
 def joint_table(contract: RobotContract) -> list[str]:
     """Return the joints' mapping and limits as lines of text."""
-    rows = [("joint", "unit", "middle", "half range", "home", "speed", "force")]
+    rows: list[tuple[str, ...]] = [("joint", "unit", "middle", "half range", "home", "speed", "force")]
     for joint in contract.joints:
         numbers = (joint.middle, joint.half_range, joint.home, joint.speed, joint.force)
         rows.append((joint.name, "m" if joint.kind == "slide" else "rad", *(f"{n:g}" for n in numbers)))

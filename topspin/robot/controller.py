@@ -61,7 +61,7 @@ class Controller:
         self._begun: tuple[tuple[float, float], bool] | None = None
         self._joints: tuple[Array, Array] | None = None
         self._held = 0
-        self._now = -math.inf
+        self.now = -math.inf  # [s] time of the last step
         self._positions: Array | None = None
 
     def _limits(self, name: str, not_finite: Fault, out_of_range: Fault) -> Limits:
@@ -130,9 +130,9 @@ class Controller:
         Raises:
             ValueError: The joints of the first step are bad, so that no target is known which is safe.
         """
-        clock = check_clock(now, self._now)
+        clock = check_clock(now, self.now)
         if math.isfinite(now):
-            self._now = now  # a clock that was set back costs one step, not all until it catches up
+            self.now = now  # a clock that was set back costs one step, not all until it catches up
         is_measured = self._take_joints(joint_pos, joint_vel)
         if clock is not None:
             self._count(clock)

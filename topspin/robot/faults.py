@@ -1,10 +1,10 @@
 """What is wrong with a measurement: bad numbers are named and counted, and never become joint targets."""
 
-from collections.abc import Sequence
 from enum import StrEnum
 from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 MAX_AGE: Final = (
     0.5  # [s] a ball that was not detected for longer is lost; an older stamp is of another clock
@@ -43,7 +43,7 @@ class Limits(NamedTuple):
     out_of_range: Fault
 
 
-def check_numbers(values: Sequence[float], size: int, limits: Limits) -> Found | None:
+def check_numbers(values: npt.ArrayLike, size: int, limits: Limits) -> Found | None:
     """Return what is wrong with measured numbers (size,), or None.
 
     Raises:

@@ -111,6 +111,6 @@ def test_the_installed_wheel_runs_the_readmes_example_without_torch_mujoco_and_t
     assert done.stderr == ""
     assert (out / "example.py").read_text() == (ROOT / "examples" / "robot.py").read_text()
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("0.00 s [")
-    assert lines[-1] == "bad measurements: {}"
+    assert lines[0].startswith("[")
+    assert lines[-1] == "{}"
     assert len(lines) == 21
