@@ -63,7 +63,13 @@ def main(argv: Sequence[str], _stop: Event) -> int:
     contract, parity = export_policy(policy, name, out, config.expected_spin)
     files = sorted(path.name for path in out.iterdir())
     if config.json_line:
-        found = {"out": str(out), "policy": name, "robot": contract.robot, "files": files, "parity_max": parity}
+        found = {
+            "out": str(out),
+            "policy": name,
+            "robot": contract.robot,
+            "files": files,
+            "parity_max": parity,
+        }
         sys.stdout.write(json.dumps(found) + "\n")
     else:
         sys.stdout.write(

@@ -28,7 +28,7 @@ from topspin.robot.controller import Array, Controller, load
 log = logging.getLogger(__name__)
 
 BALL, JOINTS, NEW_BALL, TARGETS = "ball", "joint_states", "new_ball", "joint_trajectory"
-NOT_A_NUMBER: Final = math.nan  # a joint that a message lacks: the controller counts it and holds over
+NOT_A_NUMBER: Final = math.nan  # a joint that is not known: the controller counts it and holds over
 
 
 class Messages(NamedTuple):
@@ -75,6 +75,7 @@ class RobotNode:
         self._frame, self._names = frame, list(joint_names or wanted)
         self._origin: int | None = None
         self._joints: tuple[list[float], list[float]] | None = None
+        self._steps_since_joints = 0
 
     def on_ball(self, message: Any) -> None:
         """Take a PointStamped: a detection of the ball."""
@@ -99,12 +100,19 @@ class RobotNode:
             return [float(values[k]) if k < len(values) else NOT_A_NUMBER for k in found]
 
         self._joints = of(message.position), of(message.velocity)
+        self._steps_since_joints = 0
 
     def on_timer(self, stamp: Any) -> None:
-        """Do a control step at a Time: publish a trajectory if there are new targets."""
+        """Do a control step at a Time: publish a trajectory if there are new targets.
+
+        A second step without a new JointState counts as bad joints, so that the robot stops if they stay away.
+        """
         if self._joints is None:
             return
         joint_pos, joint_vel = self._joints
+        self._steps_since_joints += 1
+        if self._steps_since_joints > 2:
+            joint_pos = joint_vel = [NOT_A_NUMBER] * len(self._names)
         try:
             command = self._controller.step(self._seconds(stamp), joint_pos, joint_vel)
         except ValueError as error:

@@ -113,6 +113,13 @@ def test_the_card_has_metadata_and_every_measured_figure(tmp_path):
     assert all(joint.name in text for joint in contract.joints)
 
 
+def test_the_card_of_a_policy_without_measures_says_so(small):
+    _, out = small
+
+    assert "This policy has not been measured." in (out / "README.md").read_text()
+    assert "model-index" not in (out / "README.md").read_text()
+
+
 def test_leapp_runs_the_exported_pipeline(small):
     policy, out = small
     obs = drawn(policy, 1)

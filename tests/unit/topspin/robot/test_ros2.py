@@ -7,7 +7,8 @@ from rosbags.typesys import Stores, get_typestore
 from common.errors import ReportedError
 from tests.unit.topspin.export.exports import export, small_policy
 from topspin.robot.contract import POLICY_FILE
-from topspin.robot.controller import Controller
+from topspin.robot.controller import MAX_HELD, Controller
+from topspin.robot.faults import Fault
 from topspin.robot.made_up_ball import detections
 from topspin.robot.network import Network
 from topspin.robot.ros2 import Messages, RobotNode
@@ -120,6 +121,19 @@ def play_directly(controller):
             controller.see(50.0 + moment, pos)
         found.append(controller.step(50.0 + 0.02 * step, home, np.zeros(7)).positions)
     return found
+
+
+def test_joint_states_that_stay_away_stop_the_robot(controller):
+    sent = []
+    node = RobotNode(controller, MESSAGES, sent.append)
+    play_ball(node, controller, 400.0)
+    sent.clear()
+    for step in range(10):
+        node.on_ball(point(400.2 + 0.02 * step, 0.1, 0.1, 0.2))
+        node.on_timer(stamp(400.2 + 0.02 * step))
+
+    assert len(sent) == 1 + MAX_HELD
+    assert controller.faults == {Fault.JOINTS_NOT_FINITE: 9}
 
 
 def test_messages_of_another_frame_are_refused_and_counted(controller):
