@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 
 from common.policy.actor_critic import NetworkConfig
 from common.service.config import recipe_names
+from common.service.endpoint import FIRST_PORT
 from common.service.settings import Fleet, RunSettings
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
@@ -45,10 +46,11 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     )
     resume: bool = Field(False, exclude=True, description="go on with runs/RUN from its newest checkpoint")
     metrics_port: int = Field(
-        0,
+        FIRST_PORT,
         ge=0,
         le=64000,
-        description="first port of /metrics, the next processes take the next ports; 0: any free ports",
+        description="first port of /metrics: learner, evaluator, generators and actors take it and the next ones that "
+        "are free; 0: any free ports",
     )
     panel: Literal["auto", "on", "off"] = Field(
         "auto", description="live terminal panel; auto: if there is a terminal"

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing
 from threading import Event
 from typing import Any, Final
 
@@ -26,6 +26,7 @@ from common.service.whole_file import write_whole
 from deploy.panel import View, render
 from deploy.prepare import PreparedRun, RunFailedError, last_epoch, prepared, settings
 from deploy.supervisor import Supervisor
+from deploy.targets import TargetsFile
 from deploy.watchdog import Watchdog
 from deploy.watcher import Watcher
 from services.learner.budget import NOTHING_LEFT
@@ -106,14 +107,19 @@ def watch(
     console = Console(stderr=True)
     has_panel = panel == "on" or (panel == "auto" and console.is_terminal)
     log_file = run.folder.logs / LOG_FILE
-    with Live(console=console, auto_refresh=False) if has_panel else nullcontext() as live:
+    with ExitStack() as stack:
+        live = stack.enter_context(Live(console=console, auto_refresh=False)) if has_panel else None
         # a panel has replaced stderr: log to the new one
         set_up_logging("info", "deploy", log_file)
         watchdog = Watchdog(LEARNER, run.config.watchdog_s)
+        targets = stack.enter_context(
+            closing(TargetsFile(run.folder.targets, run.name, run.config.metrics_host))
+        )
         while not stop.is_set() and not supervisor.has_ended(LEARNER):
             now = time.monotonic()
             supervisor.watch(now)
             watcher.look(now)
+            targets.update(view.statuses.values(), supervisor.children)
             end_hung(watchdog, supervisor, view, now)
             view.restarts = {name: child.restarts for name, child in supervisor.children.items()}
             if name := supervisor.has_bad_config():

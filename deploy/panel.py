@@ -133,7 +133,7 @@ def render(view: View, now: float) -> RenderableType:
     )
 
     processes = Table(box=None, padding=(0, 2), header_style="dim")
-    for title in ("process", "state", "doing", "heard", "restarts"):
+    for title in ("process", "state", "doing", "heard", "restarts", "metrics"):
         processes.add_column(title)
     for (role, id_), status in sorted(view.statuses.items()):
         name = f"{role}-{id_}"
@@ -145,6 +145,7 @@ def render(view: View, now: float) -> RenderableType:
             _doing(status),
             f"{silence:.0f} s ago",
             str(view.restarts.get(name, 0)),
+            _number(status.gauges, "metrics_port", ".0f"),
             style=style,
         )
     bar = ProgressBar(total=1.0, completed=share_done(view), width=60)

@@ -1,11 +1,13 @@
 """Preparing a run: its settings, its folder, its ports, and the processes that it needs."""
 
+import errno
 import os
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import islice
 from typing import Final
 
 from pydantic import ValidationError
@@ -14,6 +16,7 @@ from common.comms.keys import Keys
 from common.comms.zenoh_config import ZenohConfig
 from common.errors import ReportedError
 from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
+from common.service.endpoint import PORTS_TRIED
 from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
 from deploy.config import CONNECT_S, RECIPES, DeployConfig
 from deploy.supervisor import Spec
@@ -83,9 +86,41 @@ def last_epoch(folder: RunFolder) -> dict[str, str]:
 
 
 def metrics_ports(config: DeployConfig) -> list[int]:
-    """Return the port of each process's /metrics: learner, evaluator, generators, actors; 0 is any free one."""
+    """Return a port of /metrics for each process: learner, evaluator, generators, actors; 0 is any free one.
+
+    They are the first free ones from ``metrics_port`` on. A service whose port is taken meanwhile takes the next.
+
+    Raises:
+        ConfigError: The address can't be used, or there are not enough free ports.
+    """
     count = 1 + config.evaluate + config.generators + config.actors
-    return [config.metrics_port + i if config.metrics_port else 0 for i in range(count)]
+    if not config.metrics_port:
+        return [0] * count
+    ports = range(config.metrics_port, min(config.metrics_port + count + PORTS_TRIED, 65536))
+    free = list(islice((port for port in ports if is_free(config.metrics_host, port)), count))
+    if len(free) < count:
+        raise ConfigError(
+            f"metrics_port {config.metrics_port}: {len(free)} ports from there to {ports[-1]} are free; "
+            f"the run needs {count}; allowed: another port, or 0 for any that are free"
+        )
+    return free
+
+
+def is_free(host: str, port: int) -> bool:
+    """Return whether a port can be served now. Raises ConfigError if nothing can be served at ``host``."""
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+            probe.bind((host, port))
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            return False
+        raise ConfigError(
+            f"metrics_host {host}, port {port}: {error.strerror}; allowed: an address of this machine, and a port "
+            "that may be served"
+        ) from None
+    return True
 
 
 def free_port() -> int:
@@ -147,7 +182,7 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
         raise ConfigError(
             f"run {name!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
-    check_ports(config)
+    metrics_ports(config)  # raises before anything is written
     # A new endpoint each time unless one is set: the old one may be taken.
     link = link_to_learner(config, config.endpoint or free_endpoint())
     with folder.held_by("deploy.local"):
@@ -168,20 +203,6 @@ def write(config: DeployConfig, name: str, folder: RunFolder, endpoint: str) -> 
     tables = to_tables(config, SECTION)
     save_settings(folder.config, tables | {"run": name, "endpoint": endpoint})
     folder.point_latest_here()
-
-
-def check_ports(config: DeployConfig) -> None:
-    """Raise ConfigError with the first port of /metrics that is taken: with it a service would fail at every start."""
-    for port in filter(None, metrics_ports(config)):
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
-            try:
-                probe.bind((config.metrics_host, port))
-            except OSError as error:
-                raise ConfigError(
-                    f"port {port} can't be used: {error.strerror}; --metrics-port {config.metrics_port} needs "
-                    f"{len(metrics_ports(config))} free ports from there on"
-                ) from None
 
 
 def link_to_learner(config: DeployConfig, endpoint: str) -> ZenohConfig:

@@ -1,5 +1,6 @@
 """What a service's process keeps open while it runs: its log, its /metrics, its link to the hub."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from threading import Event
@@ -9,6 +10,8 @@ from common.comms.zenoh_transport import open_zenoh
 from common.service.log import set_up_logging
 from common.service.metrics import Metrics
 from common.service.settings import ServiceConfig
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -21,7 +24,8 @@ def connected(role: str, config: ServiceConfig, stop: Event) -> Iterator[tuple[T
         stop: Ends the wait for a hub.
     """
     set_up_logging(config.log_level, f"{role}/{config.id}")
-    with closing(Metrics(role, config.id)) as metrics:
-        metrics.serve(config.metrics_port, config.metrics_host)
+    with closing(Metrics(role, config.id, config.run)) as metrics:
+        port = metrics.serve(config.metrics_port, config.metrics_host)
+        log.info("serving metrics url=http://%s:%d/metrics", config.metrics_host, port)
         with closing(open_zenoh(config, stop)) as transport:
             yield transport, metrics

@@ -91,11 +91,13 @@ class Member:
         self._refusals: dict[str, RefusalLog] = {}
         self._link_lost: float | None = None  # [s]
         self._endpoint = config.endpoint
+        metrics.inc("topspin_messages_refused_total", 0.0, kind="control")
 
     def join(self) -> None:
         """Declare the liveliness token: the service can answer now."""
         key = self.keys.alive(self.role, self.id, self.incarnation)
         self._token = self._transport.declare_alive(key)
+        self._metrics.health.has_joined = True
 
     def watch(self, name: str, *mailboxes: Drops) -> None:
         """Count what these mailboxes drop under ``name``."""
@@ -107,6 +109,7 @@ class Member:
         Args:
             report: Answers an actor's report; None where actors do not report to this service.
         """
+        self._metrics.health.turn()  # every main loop comes by here, also within an update or a match
         allowed = (Control,) if report is None else (ActorReport, Control)
         for request in self._control.waiting(CONTROL_MAILBOX):
             try:
@@ -132,6 +135,7 @@ class Member:
 
     def note_link(self, now: float) -> None:
         """Log when the link to the hub is lost, and when it is back."""
+        self._metrics.health.is_linked = self._transport.connected
         if self._transport.connected == (self._link_lost is None):
             return
         if self._link_lost is None:
@@ -152,10 +156,12 @@ class Member:
 
     def beat(self, counters: Mapping[str, float], gauges: Mapping[str, float]) -> None:
         """Publish a heartbeat with these numbers; gauges that are nan are left out."""
+        self._metrics.set("topspin_heartbeat_time_seconds", time.time())
         self._metrics.follow("topspin_reconnects_total", self._transport.reconnect_count)
         for name, mailboxes in self._mailboxes.items():
             dropped = sum(mailbox.dropped for mailbox in mailboxes)
             self._metrics.follow("topspin_messages_dropped_total", dropped, key=name)
+        numbers = {**gauges, "metrics_port": self._metrics.port} if self._metrics.port else gauges
         status = Status(
             role=self.role,
             id=self.id,
@@ -163,11 +169,12 @@ class Member:
             time=time.time(),
             state=self.state,
             counters={name: float(value) for name, value in counters.items()},
-            gauges={name: float(value) for name, value in gauges.items() if not math.isnan(value)},
+            gauges={name: float(value) for name, value in numbers.items() if not math.isnan(value)},
         )
         self._transport.publish(self.keys.status(self.role, self.id), encode(status), Flow.STATUS)
 
     def leave(self) -> None:
         """Withdraw the liveliness token."""
+        self._metrics.health.has_joined = False
         if self._token is not None:
             self._token.close()

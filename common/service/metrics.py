@@ -3,17 +3,26 @@
 `topspin.reference` writes the table as the page docs/reference/metrics.md.
 """
 
-import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Final, Literal, TypeVar
-from wsgiref.simple_server import WSGIServer
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, start_http_server
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    GCCollector,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+)
+from prometheus_client.metrics_core import Metric as Family
 
 from common.errors import ReportedError
+from common.service.endpoint import Endpoint, Health
 
 _G, _A, _L, _E = "generator", "actor", "learner", "evaluator"
 _ALL: Final = (_G, _A, _L, _E)
@@ -26,7 +35,7 @@ _Kind = TypeVar("_Kind", Counter, Gauge, Histogram)
 
 
 class MetricsError(ReportedError, RuntimeError):
-    """A metric that isn't in the table, or a port that can't be used."""
+    """A metric that isn't in the table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +57,19 @@ def _table(*rows: Metric) -> Mapping[str, Metric]:
     return MappingProxyType(table)
 
 
+OWN_LABELS: Final = ("run", "role", "id")
+"""Labels that every sample has, whoever scrapes it: the run, and the service in it."""
+
 METRICS: Final = _table(
-    Metric("topspin_process_up", "gauge", "1", "Always 1: the service answers", _ALL, ("role", "id")),
-    Metric("topspin_alive", "gauge", "services", "Live services", (_L,), ("role",)),
+    Metric("topspin_process_up", "gauge", "1", "Always 1: the service answers", _ALL),
+    Metric(
+        "topspin_heartbeat_time_seconds",
+        "gauge",
+        "s since 1970",
+        "Time of the newest heartbeat; before the first one, start of the service",
+        _ALL,
+    ),
+    Metric("topspin_alive", "gauge", "services", "Live services", (_L,), ("service",)),
     Metric("topspin_reconnects_total", "counter", "1", "Reconnections to the hub", _ALL),
     Metric(
         "topspin_phase_seconds_total",
@@ -214,30 +233,49 @@ _KINDS: Final[Mapping[str, Callable[..., Counter | Gauge | Histogram]]] = Mappin
 class Metrics:
     """The numbers of one service, in a registry of its own: several services may share a process.
 
+    A gauge is exported from its first value on: 0 would look like one.
+
     Args:
         role: The service's role: selects the rows of the table.
         id_: Its name among the services of its role.
+        run: Its run.
     """
 
-    def __init__(self, role: str, id_: str) -> None:
+    def __init__(self, role: str, id_: str, run: str = "default") -> None:
         self._role = role
+        self._labels = {"run": run, "role": role, "id": id_}
         self._registry = CollectorRegistry()
+        ProcessCollector(registry=self._registry)
+        GCCollector(self._registry)
         self._instruments: dict[str, Counter | Gauge | Histogram] = {}
+        self._unset: set[str] = set()  # gauges that have had no value
         self._followed: dict[tuple[object, ...], float] = {}
-        self._server: WSGIServer | None = None
-        self._thread: threading.Thread | None = None
+        self._endpoint: Endpoint | None = None
+        self.health = Health()
         for metric in METRICS.values():
             if role not in metric.roles:
                 continue
             text = f"{metric.help} [{metric.unit}]"
+            is_gauge = metric.kind == "gauge"
             self._instruments[metric.name] = _KINDS[metric.kind](
-                metric.name, text, metric.labels, registry=self._registry
+                metric.name, text, metric.labels, registry=None if is_gauge else self._registry
             )
-        self.set("topspin_process_up", 1.0, role=role, id=id_)
+            if is_gauge:
+                self._unset.add(metric.name)
+        self.set("topspin_process_up", 1.0)
+        self.set("topspin_heartbeat_time_seconds", time.time())
+
+    @property
+    def port(self) -> int:
+        """The port that is served; 0: none."""
+        return self._endpoint.port if self._endpoint else 0
 
     def set(self, name: str, value: float, **labels: str) -> None:
         """Set a gauge. Raises MetricsError for a name, kind or label that this role doesn't have."""
         self._instrument(name, Gauge, labels).set(value)
+        if name in self._unset:
+            self._unset.remove(name)
+            self._registry.register(self._instruments[name])
 
     def inc(self, name: str, amount: float = 1.0, **labels: str) -> None:
         """Raise a counter; otherwise as `set`."""
@@ -258,27 +296,27 @@ class Metrics:
         return self._registry.get_sample_value(name, labels)
 
     def serve(self, port: int, host: str = "127.0.0.1") -> int:
-        """Return the port at which HTTP serves /metrics from now on; 0: any free port.
+        """Return the port at which HTTP serves /metrics, /healthz and /readyz from now on.
+
+        Args:
+            port: The first one to try: the next free one is taken. 0: any free one.
+            host: Address to listen at.
 
         Raises:
-            MetricsError: The port is taken or can't be bound.
+            PortError: The address can't be used, or all of many ports are taken.
         """
-        try:
-            self._server, self._thread = start_http_server(port, addr=host, registry=self._registry)
-        except OSError as error:
-            raise MetricsError(
-                f"can't serve metrics at {host}:{port}: {error.strerror}; "
-                "choose another metrics_port, or 0 for any that is free"
-            ) from error
-        return int(self._server.server_port)
+        self._endpoint = Endpoint(host, port, self.text, self.health)
+        return self._endpoint.port
+
+    def text(self) -> bytes:
+        """Return all samples in Prometheus' text format, each with `OWN_LABELS`."""
+        return generate_latest(_Labelled(self._registry, self._labels))
 
     def close(self) -> None:
         """Stop serving; may be called twice."""
-        if self._server is not None and self._thread is not None:
-            self._server.shutdown()
-            self._server.server_close()
-            self._thread.join()
-        self._server = self._thread = None
+        if self._endpoint is not None:
+            self._endpoint.close()
+        self._endpoint = None
 
     def _instrument(self, name: str, kind: type[_Kind], labels: Mapping[str, str]) -> _Kind:
         instrument = self._instruments.get(name)
@@ -292,6 +330,24 @@ class Metrics:
         if labels.keys() != set(wanted):
             raise MetricsError(f"{name} with labels {sorted(labels)}; allowed: {sorted(wanted)}")
         return instrument.labels(**labels) if labels else instrument
+
+
+class _Labelled(CollectorRegistry):
+    """A registry's samples with more labels, and without the times of creation, which nothing here reads."""
+
+    def __init__(self, registry: CollectorRegistry, labels: Mapping[str, str]) -> None:
+        super().__init__()
+        self._source, self._labels = registry, labels
+
+    def collect(self) -> Iterator[Family]:
+        for family in self._source.collect():
+            copy = Family(family.name, family.documentation, family.type, family.unit)
+            copy.samples = [
+                sample._replace(labels={**self._labels, **sample.labels})
+                for sample in family.samples
+                if not sample.name.endswith("_created")
+            ]
+            yield copy
 
 
 def markdown() -> str:

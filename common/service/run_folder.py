@@ -93,6 +93,11 @@ class RunFolder:
         return self.root / "logs"
 
     @property
+    def targets(self) -> Path:
+        """The addresses of the live services' /metrics, for Prometheus' file discovery."""
+        return self.root / "targets.json"
+
+    @property
     def report(self) -> Path:
         """Evaluations and reports."""
         return self.root / "report"

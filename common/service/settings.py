@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.comms.zenoh_config import LinkConfig, ZenohConfig
+from common.service.endpoint import FIRST_PORT
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 
@@ -16,7 +17,9 @@ class RunSettings(LinkConfig):
 
     run: str = Field("default", description="run that the service belongs to; part of every key")
     seed: int = Field(0, ge=0, lt=2**63, description="seed of all random numbers of the run")
-    metrics_host: str = Field("127.0.0.1", description="address that /metrics is served on")
+    metrics_host: str = Field(
+        "127.0.0.1", description="address that /metrics, /healthz and /readyz are served on"
+    )
     log_level: LogLevel = Field("info", description="lowest level that is logged")
     status_interval_s: float = Field(
         1.0, gt=0, le=60, description="time between heartbeats", json_schema_extra={"unit": "s"}
@@ -28,7 +31,11 @@ class ServiceConfig(RunSettings, ZenohConfig):
 
     id: str = Field("0", exclude=True, description="name of this service among those of its role")
     metrics_port: int = Field(
-        0, ge=0, le=65535, exclude=True, description="HTTP port of /metrics; 0: any free one"
+        FIRST_PORT,
+        ge=0,
+        le=65535,
+        exclude=True,
+        description="HTTP port of /metrics, or the next free one; 0: any free one",
     )
 
 

@@ -4,6 +4,7 @@ import logging
 import os
 import time
 from threading import Event
+from typing import Final
 
 from common.comms.codec import DecodeError, decode, encode
 from common.comms.messages import (
@@ -33,6 +34,9 @@ REPORT_INTERVAL_S = 0.25  # while without credits, until the learner sets anothe
 ASK_AGAIN_S = 1.0  # pause between requests for the policy
 LAST_VERDICTS_S = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S = 2.0
+REFUSALS: Final = frozenset(VerdictKind) - {
+    *(VerdictKind.ACCEPTED, VerdictKind.DUPLICATE, VerdictKind.BUSY, VerdictKind.CREDITS),
+}
 
 
 class ActorService:
@@ -87,6 +91,8 @@ class ActorService:
         self._idle_since: float | None = None
         self._warned = False
         self._waits_for = ""
+        for kind in REFUSALS:  # from nothing to 1 would be no rise for Prometheus
+            metrics.inc("topspin_rollouts_refused_total", 0.0, reason=kind.value)
         self._member.join()
 
     @property

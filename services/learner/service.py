@@ -142,6 +142,7 @@ class LearnerService:
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         # Without it, a learner that waits for its first actor would seem to have no checkpoint since 1970.
         metrics.set("topspin_checkpoint_time_seconds", time.time())
+        telemetry.begin(metrics)
         self._wait_for_predecessor()
         self._member.join()
         self._joined = clock()

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+from common.comms.messages import VerdictKind
 from common.service.metrics import Metrics
 from common.task.reward import TERMS
 from common.task.states import Outcome
@@ -11,6 +12,16 @@ from services.learner.intake import Intake
 from services.learner.ledger import Ledger
 
 _MEMBERS: Final = ("generator", "actor", "evaluator")
+
+
+def begin(metrics: Metrics) -> None:
+    """Export 0 for every label that counts: from nothing to 1 is no rise for Prometheus."""
+    for verdict in set(VerdictKind) - {VerdictKind.CREDITS}:
+        metrics.inc("topspin_rollouts_received_total", 0.0, verdict=verdict.value)
+    for outcome in Outcome:
+        if outcome is not Outcome.NONE:
+            metrics.inc("topspin_outcomes_total", 0.0, outcome=outcome.name.lower())
+    metrics.inc("topspin_phase_seconds_total", 0.0, phase="update")
 
 
 def epoch_gauges(stats: EpochStats, frames_per_s: float) -> dict[str, float]:
@@ -94,7 +105,7 @@ def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Itera
     metrics.set("topspin_misfit_actors", len(intake.misfits))
     roles = list(alive)
     for role in _MEMBERS:
-        metrics.set("topspin_alive", roles.count(role), role=role)
+        metrics.set("topspin_alive", roles.count(role), service=role)
 
 
 def heartbeat(

@@ -1,5 +1,6 @@
 """Services of one run in one process, each on a thread of its own, over real Zenoh on loopback."""
 
+import re
 import socket
 import threading
 import time
@@ -84,11 +85,14 @@ class Running:
         self.join()
 
     def scrape(self):
-        """Return the metrics as Prometheus reads them, over HTTP."""
+        """Return the metrics as Prometheus reads them, over HTTP; without the labels that all of a service's have."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/metrics", timeout=5) as answer:
             lines = answer.read().decode().splitlines()
         pairs = (line.rsplit(" ", 1) for line in lines if line and not line.startswith("#"))
-        return {name: float(value) for name, value in pairs}
+        own = re.compile(r'(run|role|id)="[^"]*",?')
+        return {
+            own.sub("", name).replace(",}", "}").removesuffix("{}"): float(value) for name, value in pairs
+        }
 
     def metric(self, name, **labels):
         """Return one metric, 0 if it was never set."""

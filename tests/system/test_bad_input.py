@@ -114,18 +114,14 @@ def test_a_taken_port_of_the_learner_is_named(tmp_path):
         assert "Address already in use" in line
 
 
-def test_a_taken_port_of_the_metrics_is_named_before_anything_starts(tmp_path):
-    with socket.socket() as holder:
-        holder.bind(("127.0.0.1", 0))
-        holder.listen()
-        port = holder.getsockname()[1]
-        alone = one_line(tmp_path, ACTOR, "--metrics-port", port)
-        whole = one_line(tmp_path, DEPLOY, "--run", "r", "--metrics-port", port - 1)
+def test_an_address_that_is_not_this_machines_is_named_before_anything_starts(tmp_path):
+    alone = one_line(tmp_path, ACTOR, "--metrics-host", "192.0.2.1")
+    whole = one_line(tmp_path, DEPLOY, "--run", "r", "--metrics-host", "192.0.2.1")
 
     assert alone[0] == 1
-    assert f"127.0.0.1:{port}" in alone[1]
+    assert "can't serve metrics at 192.0.2.1:9100: Cannot assign" in alone[1]
     assert whole[0] == 2
-    assert f"port {port} can't be used: Address already in use" in whole[1]
+    assert "metrics_host 192.0.2.1, port 9100: Cannot assign" in whole[1]
     assert not (tmp_path / "runs" / "r").exists()
 
 

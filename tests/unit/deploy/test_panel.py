@@ -30,7 +30,7 @@ def full_view():
     rates = {"catch_rate": 0.913, "return_rate": 0.42, "target_error": 0.51, "reward": 33.3, "lag": 0.5}
     counts = {"frames": 5.2e6, "published": 24.0, "trained": 22.0, "in_flight": 1.0, "lost": 1.0}
     view.hear(make_status("learner", counters=counts, gauges=gauges | rates), 9.0)
-    view.hear(make_status("actor", "1", {"frames": 2.6e6}, {"version": 12.0}), 9.5)
+    view.hear(make_status("actor", "1", {"frames": 2.6e6}, {"version": 12.0, "metrics_port": 9103.0}), 9.5)
     view.hear(make_status("generator", "0", {"published": 4096.0, "drawn": 300.0, "valid": 87.0}), 3.0)
     view.hear(make_status("evaluator", "0", {"evaluations": 3.0}, {"catch_rate": 0.95, "frames": 5.0e6}), 9.0)
     view.restarts = {"actor-1": 2}
@@ -60,7 +60,7 @@ def test_it_shows_the_state_of_the_run():
     ):
         assert part in text, part
     actor = next(line for line in text.splitlines() if "actor-1" in line)
-    assert actor.rstrip(" │").endswith("2")
+    assert actor.rstrip(" │").split()[-2:] == ["2", "9103"]
     assert all(len(line) <= 100 for line in text.splitlines())
 
 
