@@ -20,6 +20,7 @@ from common.service.endpoint import PORTS_TRIED
 from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
 from deploy.config import CONNECT_S, RECIPES, DeployConfig
 from deploy.supervisor import Spec
+from deploy.topology import ROLES, Role
 from services.learner.budget import ENDING_S, Budget
 
 SECTION: Final = "local"
@@ -56,9 +57,9 @@ class PreparedRun:
         file = str(self.folder.config)
         ports = iter(metrics_ports(config))
 
-        def service(role: str, index: int, *more: str) -> Spec:
-            arguments = ("--config", file, "--id", str(index), "--metrics-port", str(next(ports)), *more)
-            return Spec(f"{role}-{index}", role, (f"services.{role}", *arguments), restart=True)
+        def service(role: Role, index: int, *more: str) -> Spec:
+            arguments = role.arguments(str(index), file, str(next(ports)), *more)
+            return Spec(f"{role.name}-{index}", role.name, arguments, restart=True)
 
         def resumed() -> tuple[str, ...]:
             """Return the flag to go on from the newest checkpoint, if there is one."""
@@ -70,12 +71,10 @@ class PreparedRun:
 
         # The learner holds the run's state: the run ends when it is done. A run that was stopped before its first
         # checkpoint starts from the beginning.
-        learner = service("learner", 0, *(resumed() if config.resume else ()))
-        found = [replace(learner, keeps_run=True, again=resumed, made=newest_checkpoint)]
-        if config.evaluate:
-            found.append(service("evaluator", 0))
-        found += [service("generator", i, "--index", str(i)) for i in range(config.generators)]
-        found += [service("actor", i, "--index", str(i)) for i in range(config.actors)]
+        learner, *workers = ROLES
+        keeper = service(learner, 0, *(resumed() if config.resume else ()))
+        found = [replace(keeper, keeps_run=True, again=resumed, made=newest_checkpoint)]
+        found += [service(role, i) for role in workers for i in range(role.count(config))]
         return found
 
 
@@ -93,7 +92,7 @@ def metrics_ports(config: DeployConfig) -> list[int]:
     Raises:
         ConfigError: The address can't be used, or there are not enough free ports.
     """
-    count = 1 + config.evaluate + config.generators + config.actors
+    count = sum(role.count(config) for role in ROLES)
     if not config.metrics_port:
         return [0] * count
     ports = range(config.metrics_port, min(config.metrics_port + count + PORTS_TRIED, 65536))

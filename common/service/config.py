@@ -35,7 +35,7 @@ from common.service.whole_file import write_whole
 ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
 TABLES: Final = (
     *("task", "experience", "network"),
-    *("generator", "actor", "learner", "evaluator"),
+    *("generator", "actor", "learner", "evaluator", "router"),
     *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "export", "bench"),
 )
 """Tables of a settings file. A nested model of one of these names is read from that table, whatever the program."""

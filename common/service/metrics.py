@@ -25,6 +25,7 @@ from common.errors import ReportedError
 from common.service.endpoint import Endpoint, Health
 
 _G, _A, _L, _E = "generator", "actor", "learner", "evaluator"
+_R: Final = "router"
 _ALL: Final = (_G, _A, _L, _E)
 
 # Latencies from a tenth of a millisecond to a minute.
@@ -61,13 +62,13 @@ OWN_LABELS: Final = ("run", "role", "id")
 """Labels that every sample has, whoever scrapes it: the run, and the service in it."""
 
 METRICS: Final = _table(
-    Metric("topspin_process_up", "gauge", "1", "Always 1: the service answers", _ALL),
+    Metric("topspin_process_up", "gauge", "1", "Always 1: the service answers", (*_ALL, _R)),
     Metric(
         "topspin_heartbeat_time_seconds",
         "gauge",
         "s since 1970",
         "Time of the newest heartbeat; before the first one, start of the service",
-        _ALL,
+        (*_ALL, _R),
     ),
     Metric("topspin_alive", "gauge", "services", "Live services", (_L,), ("service",)),
     Metric("topspin_reconnects_total", "counter", "1", "Reconnections to the hub", _ALL),

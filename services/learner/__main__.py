@@ -18,9 +18,14 @@ PROG = "python -m services.learner"
 
 def settings(argv: Sequence[str]) -> LearnerConfig:
     """Return the learner's settings; with --resume those of the run's config.toml, except for flags given now."""
-    asked = first_look(LearnerConfig, ("run", "folder", "resume"), argv, prog=PROG, section="learner")
-    file = RunFolder.of(asked.run, asked.folder).config
-    if not (asked.resume and file.exists()):
+    names = ("run", "folder", "resume", "auto_resume")
+    asked = first_look(LearnerConfig, names, argv, prog=PROG, section="learner")
+    folder = RunFolder.of(asked.run, asked.folder)
+    is_resumed = asked.resume
+    if asked.auto_resume and not is_resumed and checkpoint.checkpoints(folder.checkpoints):
+        argv, is_resumed = [*argv, "--resume"], True
+    file = folder.config
+    if not (is_resumed and file.exists()):
         return load(LearnerConfig, argv, prog=PROG, section="learner")
     found = load(LearnerConfig, argv, prog=PROG, section="learner", recorded=file)
     # The flag's name wins: the file in a copied folder has the name of the original run.

@@ -65,6 +65,12 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
     resume: bool = Field(
         False, exclude=True, description="go on from the newest checkpoint in the run folder"
     )
+    auto_resume: bool = Field(
+        False,
+        exclude=True,
+        description="--resume if the run folder has a checkpoint, otherwise start the run: for whoever starts the "
+        "learner again with the same command",
+    )
 
     @model_validator(mode="after")
     def _settings_fit_each_other(self) -> Self:

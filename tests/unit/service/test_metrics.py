@@ -14,7 +14,7 @@ def test_names_have_the_suffixes_that_prometheus_expects():
         assert metric.name.startswith("topspin_")
         assert metric.name.endswith("_total") == (metric.kind == "counter")
         assert metric.help[0].isupper()
-        assert set(metric.roles) <= {"generator", "actor", "learner", "evaluator"}
+        assert set(metric.roles) <= {"generator", "actor", "learner", "evaluator", "router"}
         assert len(metric.labels) <= 2
         assert not set(metric.labels) & set(OWN_LABELS)  # one of these would hide the service's own
 

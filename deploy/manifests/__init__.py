@@ -1,0 +1,1 @@
+"""The files that run and watch Topspin elsewhere, written from tables: `python -m deploy.manifests`."""

@@ -1,0 +1,302 @@
+"""Kubernetes: a kustomize base of an open run in its own namespace, and an overlay with TLS.
+
+Every role is a StatefulSet. The number of a pod is the service's id and index, and names its certificate; pods of a
+Deployment have none. Actors and generators start and stop in parallel and keep no files.
+"""
+
+from typing import Any, Final
+
+from common.service.endpoint import FIRST_PORT
+from deploy.manifests.alarms import WAIT_SHARE
+from deploy.manifests.site import (
+    CACHE,
+    CERTIFICATES,
+    HUNGER,
+    IMAGE,
+    LINK_PORT,
+    ROUTER,
+    ROUTER_GRACE_S,
+    SITE,
+    USER,
+    WORK,
+    command,
+    probe,
+    settings,
+)
+from deploy.topology import ROLES, Resources, Role
+
+NAMESPACE: Final = "topspin"
+HUB: Final = "hub"  # the service that all connect to: the router's, or with TLS the learner's
+INDEX: Final = "$(POD_INDEX)"  # Kubernetes puts the pod's number here
+_PART: Final = "app.kubernetes.io/part-of"
+_ROLE: Final = "app.kubernetes.io/component"
+_NUMBER: Final = "apps.kubernetes.io/pod-index"
+_START_S: Final = 300  # a pod on a kind of CPU that the image was not built on compiles its kernels first
+_LEARNER_DISK: Final = "20Gi"
+_EVALUATOR_DISK: Final = "1Gi"
+
+
+def labels(role: str) -> dict[str, str]:
+    """Return the labels of a role's pods."""
+    return {_PART: "topspin", _ROLE: role, "topspin/run": SITE.run}
+
+
+def base() -> dict[str, list[dict[str, Any]] | dict[str, Any] | str]:
+    """Return the files of the base by name: one object, several, or text."""
+    return {
+        "namespace.yaml": _namespace(),
+        "router.yaml": [_router(), _service(HUB, "router", LINK_PORT)],
+        **{f"{role.name}.yaml": _workload(role) for role in ROLES},
+        "network.yaml": _policies(),
+        "disruptions.yaml": [_keep_one("router"), _keep_one("learner")],
+        "autoscaler.yaml": _autoscaler(),
+        "config.toml": settings(f"tcp/{HUB}:{LINK_PORT}"),
+        "kustomization.yaml": {
+            "apiVersion": "kustomize.config.k8s.io/v1beta1",
+            "kind": "Kustomization",
+            "namespace": NAMESPACE,
+            "resources": [
+                *("namespace.yaml", "router.yaml"),
+                *(f"{role.name}.yaml" for role in ROLES),
+                *("network.yaml", "disruptions.yaml", "autoscaler.yaml"),
+            ],
+            "configMapGenerator": [{"name": "settings", "files": ["config.toml"]}],
+            "images": [{"name": "topspin", "newTag": IMAGE.partition(":")[2]}],
+        },
+    }
+
+
+def tls() -> dict[str, list[dict[str, Any]] | dict[str, Any] | str]:
+    """Return the files of the overlay with TLS: the learner is the hub, since the hub applies the roles' rules."""
+    mounts = {role.name: _certificates_patch(role) for role in ROLES}
+    return {
+        "config.toml": settings(f"tls/{HUB}:{LINK_PORT}", tls=True),
+        **{f"{name}.yaml": patch for name, patch in mounts.items()},
+        "hub.yaml": _service(HUB, "learner", LINK_PORT),
+        "no-router.yaml": {"$patch": "delete", **_head("apps/v1", "Deployment", "router")},
+        "no-router-budget.yaml": {"$patch": "delete", **_head("policy/v1", "PodDisruptionBudget", "router")},
+        "kustomization.yaml": {
+            "apiVersion": "kustomize.config.k8s.io/v1beta1",
+            "kind": "Kustomization",
+            "namespace": NAMESPACE,
+            "resources": ["../base"],
+            "patches": [
+                {"path": f"{name}.yaml"} for name in ("hub", "no-router", "no-router-budget", *mounts)
+            ],
+            "configMapGenerator": [{"name": "settings", "behavior": "replace", "files": ["config.toml"]}],
+        },
+    }
+
+
+# ---- parts
+
+
+def _head(version: str, kind: str, name: str, **more: Any) -> dict[str, Any]:
+    return {"apiVersion": version, "kind": kind, "metadata": {"name": name, "namespace": NAMESPACE, **more}}
+
+
+def _namespace() -> dict[str, Any]:
+    return {
+        "apiVersion": "v1",
+        "kind": "Namespace",
+        "metadata": {"name": NAMESPACE, "labels": {"pod-security.kubernetes.io/enforce": "restricted"}},
+    }
+
+
+def _service(name: str, role: str, port: int) -> dict[str, Any]:
+    return _head("v1", "Service", name) | {
+        "spec": {
+            "selector": labels(role),
+            "ports": [{"name": "link", "port": port, "targetPort": "link"}],
+        }
+    }
+
+
+def _headless(role: Role) -> dict[str, Any]:
+    return _head("v1", "Service", role.name, labels=labels(role.name)) | {
+        "spec": {
+            "clusterIP": "None",
+            "selector": labels(role.name),
+            "ports": [{"name": "metrics", "port": FIRST_PORT}],
+        }
+    }
+
+
+def _container(arguments: list[str], needs: Resources) -> dict[str, Any]:
+    return {
+        "name": "topspin",
+        "image": IMAGE.partition(":")[0],
+        "args": arguments,
+        "ports": [{"name": "metrics", "containerPort": FIRST_PORT}],
+        "resources": {
+            "requests": {"cpu": _cores(needs.cores), "memory": f"{needs.memory_mib}Mi"},
+            "limits": {"cpu": _cores(needs.cores_limit), "memory": f"{needs.memory_limit_mib}Mi"},
+        },
+        "startupProbe": probe("/healthz", 5, _START_S // 5),
+        "livenessProbe": probe("/healthz", 20, 6),  # with its own 60 s: a kernel that compiles is no hang
+        "readinessProbe": probe("/readyz", 5, 2),
+        "securityContext": {
+            "allowPrivilegeEscalation": False,
+            "readOnlyRootFilesystem": True,
+            "capabilities": {"drop": ["ALL"]},
+        },
+        "volumeMounts": [{"name": "tmp", "mountPath": "/tmp"}, {"name": "cache", "mountPath": CACHE}],
+    }
+
+
+def _cores(cores: float) -> str:
+    return f"{round(cores * 1000)}m"
+
+
+def _pod(role: str, container: dict[str, Any], grace_s: int, volumes: list[dict[str, Any]]) -> dict[str, Any]:
+    return {
+        "metadata": {
+            "labels": labels(role),
+            "annotations": {"prometheus.io/scrape": "true", "prometheus.io/port": str(FIRST_PORT)},
+        },
+        "spec": {
+            "automountServiceAccountToken": False,
+            "enableServiceLinks": False,
+            "terminationGracePeriodSeconds": grace_s,
+            "securityContext": {
+                "runAsNonRoot": True,
+                "runAsUser": USER,
+                "runAsGroup": USER,
+                "fsGroup": USER,
+                "seccompProfile": {"type": "RuntimeDefault"},
+            },
+            "containers": [container],
+            "volumes": [{"name": "tmp", "emptyDir": {}}, {"name": "cache", "emptyDir": {}}, *volumes],
+        },
+    }
+
+
+def _router() -> dict[str, Any]:
+    container = _container(list(ROUTER), Resources(0.25, 1.0, 128, 512))
+    container["ports"].append({"name": "link", "containerPort": LINK_PORT})
+    return _head("apps/v1", "Deployment", "router", labels=labels("router")) | {
+        "spec": {
+            "replicas": 1,
+            "strategy": {"type": "Recreate"},  # two that don't know each other would split the run
+            "selector": {"matchLabels": labels("router")},
+            "template": _pod("router", container, ROUTER_GRACE_S, []),
+        }
+    }
+
+
+def _workload(role: Role) -> list[dict[str, Any]]:
+    container = _container(command(role, INDEX), role.resources)
+    container["env"] = [
+        {"name": "POD_INDEX", "valueFrom": {"fieldRef": {"fieldPath": f"metadata.labels['{_NUMBER}']"}}}
+    ]
+    container["volumeMounts"].append({"name": "settings", "mountPath": "/etc/topspin", "readOnly": True})
+    if role.name == "learner":
+        container["ports"].append({"name": "link", "containerPort": LINK_PORT})
+    spec: dict[str, Any] = {
+        "serviceName": role.name,
+        "podManagementPolicy": "Parallel",
+        "selector": {"matchLabels": labels(role.name)},
+        "template": _pod(
+            role.name, container, role.grace_s, [{"name": "settings", "configMap": {"name": "settings"}}]
+        ),
+    }
+    if role.name != "actor":  # the autoscaler sets the number of actors
+        spec = {"replicas": role.count(SITE), **spec}
+    if role.keeps_files:
+        disk = _LEARNER_DISK if role.name == "learner" else _EVALUATOR_DISK
+        container["volumeMounts"].append({"name": "work", "mountPath": WORK})
+        spec["volumeClaimTemplates"] = [
+            {
+                "metadata": {"name": "work"},
+                "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": disk}}},
+            }
+        ]
+    workload = _head("apps/v1", "StatefulSet", role.name, labels=labels(role.name)) | {"spec": spec}
+    return [workload, _headless(role)]
+
+
+def _certificates_patch(role: Role) -> dict[str, Any]:
+    """Return the patch that mounts a role's certificates; with them the learner listens itself."""
+    container: dict[str, Any] = {
+        "name": "topspin",
+        "volumeMounts": [{"name": "tls", "mountPath": CERTIFICATES, "readOnly": True}],
+    }
+    if role.name == "learner":
+        arguments = command(role, INDEX, is_hub=True)
+        container["args"] = [*arguments, "--endpoint", f"tls/0.0.0.0:{LINK_PORT}"]
+    secret = {"name": "tls", "secret": {"secretName": f"tls-{role.name}", "defaultMode": 0o440}}
+    pod = {"spec": {"containers": [container], "volumes": [secret]}}
+    return _head("apps/v1", "StatefulSet", role.name) | {"spec": {"template": pod}}
+
+
+def _keep_one(role: str) -> dict[str, Any]:
+    return _head("policy/v1", "PodDisruptionBudget", role) | {
+        "spec": {"minAvailable": 1, "selector": {"matchLabels": labels(role)}}
+    }
+
+
+def _autoscaler() -> dict[str, Any]:
+    """Return the rule that adds actors while the learner waits for data, and takes them away again."""
+    return _head("autoscaling/v2", "HorizontalPodAutoscaler", "actor") | {
+        "spec": {
+            "scaleTargetRef": {"apiVersion": "apps/v1", "kind": "StatefulSet", "name": "actor"},
+            "minReplicas": SITE.fewest_actors,
+            "maxReplicas": SITE.actors,  # actors beyond the setting would get no environments of their own
+            "metrics": [
+                {
+                    "type": "External",
+                    "external": {
+                        "metric": {"name": WAIT_SHARE, "selector": {"matchLabels": {"run": SITE.run}}},
+                        "target": {"type": "Value", "value": f"{round(HUNGER * 1000)}m"},
+                    },
+                }
+            ],
+            "behavior": {
+                "scaleUp": {"stabilizationWindowSeconds": 120},
+                "scaleDown": {"stabilizationWindowSeconds": 600},
+            },
+        }
+    }
+
+
+def _policies() -> list[dict[str, Any]]:
+    """Return who may connect: nobody, but the pods of the run with its hub, and any namespace's Prometheus."""
+    all_pods = {"matchLabels": {_PART: "topspin"}}
+    link = [{"protocol": "TCP", "port": LINK_PORT}]
+    names = [{"protocol": protocol, "port": 53} for protocol in ("UDP", "TCP")]
+    monitoring = {
+        "namespaceSelector": {},
+        "podSelector": {"matchLabels": {"app.kubernetes.io/name": "prometheus"}},
+    }
+    hubs = {"matchExpressions": [{"key": _ROLE, "operator": "In", "values": ["router", "learner"]}]}
+    return [
+        _policy("nothing-else", {"podSelector": {}, "policyTypes": ["Ingress", "Egress"]}),
+        _policy(
+            "link",
+            {
+                "podSelector": hubs,
+                "policyTypes": ["Ingress"],
+                "ingress": [{"from": [{"podSelector": all_pods}], "ports": link}],
+            },
+        ),
+        _policy(
+            "metrics",
+            {
+                "podSelector": all_pods,
+                "policyTypes": ["Ingress"],
+                "ingress": [{"from": [monitoring], "ports": [{"protocol": "TCP", "port": FIRST_PORT}]}],
+            },
+        ),
+        _policy(
+            "out",
+            {
+                "podSelector": all_pods,
+                "policyTypes": ["Egress"],
+                "egress": [{"to": [{"podSelector": hubs}], "ports": link}, {"ports": names}],
+            },
+        ),
+    ]
+
+
+def _policy(name: str, spec: dict[str, Any]) -> dict[str, Any]:
+    return _head("networking.k8s.io/v1", "NetworkPolicy", name) | {"spec": spec}
