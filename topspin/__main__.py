@@ -55,6 +55,12 @@ def _pictures(argv: Sequence[str], stop: Event) -> int:
     return main(argv, stop)
 
 
+def _certs(argv: Sequence[str], stop: Event) -> int:
+    from topspin.certs import main
+
+    return main(argv, stop)
+
+
 def _release(argv: Sequence[str], stop: Event) -> int:
     from topspin.release import main
 
@@ -76,6 +82,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "report": Command(_report, "compare runs: tables and plots beside the paper's"),
     "real2sim": Command(_real2sim, "play recordings of real balls"),
     "pictures": Command(_pictures, "draw stills of a policy's best rally"),
+    "certs": Command(_certs, "make certificates, with which a run is encrypted and roles hold"),
     "release": Command(_release, "put a policy into the box, with its measures"),
 }
 

@@ -14,7 +14,7 @@ from common.comms.messages import (
 )
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.policy.contract import PolicyError
-from common.service.member import LEARNER_ID, Member
+from common.service.member import Member
 from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
@@ -164,7 +164,8 @@ class ActorService:
         if not self._transport.connected:
             return f"the link to the hub at {self._config.endpoint}"
         if not self._following.standing:
-            return f"a learner: run {self._config.run!r} has none at the hub"
+            unknown = ", or the hub does not know this certificate" if self._config.tls else ""
+            return f"a learner: run {self._config.run!r} has none at the hub{unknown}"
         if snapshot is None:
             return self._misfit or f"a policy from the learner on {self._keys.policy()}"
         self._ready = now if self._ready is None else self._ready
@@ -313,7 +314,10 @@ class ActorService:
             if flight.tries:
                 self._metrics.inc("topspin_rollouts_retried_total", 1.0)
             self._pending[flight.sequence] = self._transport.request(
-                self._keys.rollout(), flight.payload, self._config.outbox.request_timeout_s, Flow.ROLLOUT
+                self._keys.rollout(self._config.id),
+                flight.payload,
+                self._config.outbox.request_timeout_s,
+                Flow.ROLLOUT,
             )
             self._metrics.inc("topspin_bytes_sent_total", len(flight.payload))
             self._outbox = box.sent(self._outbox, flight.sequence)
@@ -386,7 +390,7 @@ class ActorService:
         )
         self._reported = (snapshot.generation, snapshot.version) if snapshot else (0, 0)
         return self._transport.request(
-            self._keys.ctl("learner", LEARNER_ID), encode(report), timeout_s, Flow.CONTROL
+            self._keys.report(self._config.id), encode(report), timeout_s, Flow.CONTROL
         )
 
     # ---- numbers

@@ -38,7 +38,9 @@ FOLD_LAST_AFTER_S: Final = 86_400.0  # the last life of an actor: by then it has
 MOST_ACCOUNTS: Final = 16_384  # a new one beyond closes a dead one early, or is refused
 LIVES_KEPT: Final = 4096  # closed lives whose late messages are told from those of new ones
 
-LONGEST_JUMP: Final = 65_536  # of the numbers of a known life: far more than any window or outage takes
+# How far the numbers of a known life may go on in one message
+BEYOND_CREDITS: Final = 64  # more than any window: from what this learner granted
+LONGEST_JUMP: Final = 65_536  # more than any outage takes: from what an earlier learner may have granted
 
 EARLIER: Final = ("", 0)  # the account of all closed lives
 
@@ -415,7 +417,8 @@ class Intake:
         account = self._accounts.get(key)
         if account is None or key in self._awaited or not account.published:
             return ""
-        most = max(account.published, account.credit_limit) + LONGEST_JUMP
+        jump = BEYOND_CREDITS if account.credit_limit else LONGEST_JUMP
+        most = max(account.published, account.credit_limit) + jump
         return "" if number <= most else f"number {number}; allowed: up to {most}"
 
     def _close(self, key: _Key) -> None:

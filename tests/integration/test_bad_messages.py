@@ -7,7 +7,7 @@ import numpy as np
 
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
-from common.comms.messages import PolicySnapshot, RallyBatch, StageChange, Status, Verdict
+from common.comms.messages import ActorReport, PolicySnapshot, RallyBatch, StageChange, Status, Verdict
 from common.comms.transport import Flow, NoReply
 from common.policy.weights import load_tensors, save_tensors
 from common.task.config import TaskConfig
@@ -17,6 +17,7 @@ from tests.unit.comms.test_codec import sealed
 from tests.unit.services.learner.rollouts import make_rollout
 
 KEYS = Keys("test")
+REPORT = ActorReport("test", "client", 1, 0, 0, (), (), 0, (), leaving=False)
 PAPER = TaskConfig(observation=PAPER_OBSERVATION)  # the task of the client's rollouts
 LONG = CURRICULUM.model_copy(update={"stage_1": 500})
 
@@ -42,7 +43,7 @@ class ForeignClient:
         return make_rollout(**(values | changes))
 
     def send(self, payload, key=None):
-        return self.transport.request(key or KEYS.rollout(), payload, 5.0, Flow.ROLLOUT).wait()
+        return self.transport.request(key or KEYS.rollout("client"), payload, 5.0, Flow.ROLLOUT).wait()
 
     def verdict(self, payload):
         return decode(self.send(payload).payload, Verdict)
@@ -99,12 +100,14 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
             ("unreadable", "not readable", bytes(spoilt)),
             ("unreadable", "not readable", b""),
             ("unreadable", "not readable", encode(status())),
+            ("unreadable", "actor other; allowed: client", encode(client.rollout(actor="other"))),
         ]
         before = dict(learner.scrape())
         verdicts = [client.verdict(payload) for _, _, payload in bad]
         after = learner.scrape()
         refusal = client.send(b"nonsense", KEYS.ctl("learner", "0"))
-        token = client.transport.declare_alive("topspin/v1/test/alive/actor/x/²")
+        forged = client.send(encode(dataclasses.replace(REPORT, actor="other")), KEYS.report("client"))
+        token = client.transport.declare_alive("topspin/v2/test/alive/actor/x/²")
         wait_until(
             lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1,
             5,
@@ -124,6 +127,7 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
         name = f'topspin_rollouts_received_total{{verdict="{kind}"}}'
         assert after[name] - before.get(name, 0.0) == sum(k == kind for k, _, _ in bad)
     assert refusal is NoReply.NO_SERVER
+    assert forged is NoReply.NO_SERVER
     assert ledger.balance == 0
     assert ledger.trained == 10
     assert ledger.lost == 0
@@ -134,7 +138,7 @@ def test_a_message_over_the_limit_is_dropped_and_others_are_still_served(tmp_pat
         learner = s.learner()
         client, other = ForeignClient(s.peer()), ForeignClient(s.peer())
         big = encode(client.rollout(**{n: getattr(make_rollout(steps=128, envs=96), n) for n in BLOCK}))
-        outcome = client.transport.request(KEYS.rollout(), big, 2.0, Flow.ROLLOUT).wait()
+        outcome = client.transport.request(KEYS.rollout("client"), big, 2.0, Flow.ROLLOUT).wait()
         for _ in range(2):
             assert other.verdict(encode(other.rollout())).kind == "accepted"
         wait_until(lambda: other.policy().version == 1, 20, "an update")

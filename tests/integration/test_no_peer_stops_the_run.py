@@ -67,7 +67,7 @@ def test_credits_of_an_actor_that_reports_and_never_plays_go_to_others(tmp_path)
         idle = ActorReport("test", "idle", 1, 0, 0, (), (), 0, (), False, newest_policy(peer).training_hash)
 
         def report():
-            outcome = peer.request(KEYS.ctl("learner", "0"), encode(idle), 5.0, Flow.CONTROL).wait()
+            outcome = peer.request(KEYS.report("idle"), encode(idle), 5.0, Flow.CONTROL).wait()
             return decode(outcome.payload, Verdict) if isinstance(outcome, Reply) else None
 
         assert report().credit_limit == 1

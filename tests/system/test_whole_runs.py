@@ -211,3 +211,20 @@ def test_when_the_parent_ends_so_do_its_processes(tmp_path, number):
     assert status == (130 if number == signal.SIGTERM else -9)
     if number == signal.SIGTERM:
         assert json.loads(out.splitlines()[-1])["run"] == "r"
+
+
+def test_with_certificates_a_run_trains_and_every_process_has_its_own(tmp_path):
+    status, _, err = run(tmp_path, "topspin", "certs", "--days", 1)
+    assert status == 0, err
+    flags = ("--run", "r", "--tls", "certs", *TINY, *STAGES, "--learner.curriculum.stage-3", 2)
+    status, out, err = run(tmp_path, "deploy.local", *flags)
+    ledger = last_json(out)["ledger"]
+    logs = {path.stem: path.read_text() for path in (tmp_path / "runs" / "r" / "logs").iterdir()}
+
+    assert status == 0, err
+    assert (ledger["trained"], ledger["lost"], ledger["refused"]) == (7, 0, 0)
+    assert "endpoint=tls/127.0.0.1:" in err
+    for name in ("learner-0", "actor-0", "generator-0", "evaluator-0"):
+        assert f"link secured certificate=certs/{name}.pem" in logs[name]
+    assert "link secured certificate=certs/operator-0.pem" in err
+    assert "is not in the folder" not in logs["learner-0"]

@@ -10,10 +10,10 @@ from services.actor.outbox import Flight, Outbox, OutboxConfig, report
 from services.learner import intake as intake_module
 from services.learner.admission import RULES, open_rollout
 from services.learner.intake import (
+    BEYOND_CREDITS,
     EARLIER,
     FOLD_AFTER_S,
     IDLE_REPORTS_HZ,
-    LONGEST_JUMP,
     SOONEST_REPORT_S,
     Intake,
     IntakeConfig,
@@ -420,7 +420,7 @@ def test_a_number_far_beyond_those_of_its_actor_changes_no_account():
     answer = intake.report(claim, 0.0)
 
     assert wild.kind is VerdictKind.INVALID
-    assert wild.reason == f"number {2**53}; allowed: up to {3 + LONGEST_JUMP}"
+    assert wild.reason == f"number {2**53}; allowed: up to {3 + BEYOND_CREDITS}"
     assert answer.credit_limit == 0
     assert intake.total() == before
 
