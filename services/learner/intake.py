@@ -210,7 +210,7 @@ class Intake:
             now: The caller's clock [s].
         """
         self._now = now
-        known = self._known(header)
+        known, account = self._known(header), self._accounts.get(header.life)
         case = Case(
             header=header,
             learner=self._learner_state,
@@ -219,6 +219,7 @@ class Intake:
             queue_limit=self._queue_limit(),
             version_at_use=self._version_at_use(),
             max_lag=self._config.max_lag,
+            credit_end=(account.credit_limit if account else 0) + self._config.window,
         )
         kind, reason = judge(case)
         if kind is VerdictKind.WRONG_RUN:

@@ -25,8 +25,8 @@ LONG = CURRICULUM.model_copy(update={"stage_1": 500})
 class ForeignClient:
     """A program with a connection that can write rollouts."""
 
-    def __init__(self, transport):
-        self.transport = transport
+    def __init__(self, transport, name="client"):
+        self.transport, self.name = transport, name
         self.sent = 0
 
     def policy(self):
@@ -36,14 +36,14 @@ class ForeignClient:
 
     def rollout(self, **changes):
         """Return a rollout that the learner accepts, except for ``changes``."""
-        newest, values = self.policy(), {"actor": "client", "run": "test", "sequence": self.sent}
+        newest, values = self.policy(), {"actor": self.name, "run": "test", "sequence": self.sent}
         for name in ("generation", "version", "stage_number", "training_hash"):
             values[name] = getattr(newest, name)
         self.sent += 1
         return make_rollout(**(values | changes))
 
     def send(self, payload, key=None):
-        return self.transport.request(key or KEYS.rollout("client"), payload, 5.0, Flow.ROLLOUT).wait()
+        return self.transport.request(key or KEYS.rollout(self.name), payload, 5.0, Flow.ROLLOUT).wait()
 
     def verdict(self, payload):
         return decode(self.send(payload).payload, Verdict)
@@ -114,8 +114,10 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
             "the invalid token",
         )
         token.close()
+        paused = client.verdict(encode(client.rollout()))  # after so many refusals it has no credits
+        other = ForeignClient(s.peer(), "other")
         for _ in range(2):
-            client.verdict(encode(client.rollout()))
+            other.verdict(encode(other.rollout()))
         wait_until(lambda: client.policy().version == newest.version + 1, 20, "one more update")
         learner.end()
         ledger = learner.service.ledger()
@@ -126,6 +128,7 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
     for kind in {kind for kind, _, _ in bad}:
         name = f'topspin_rollouts_received_total{{verdict="{kind}"}}'
         assert after[name] - before.get(name, 0.0) == sum(k == kind for k, _, _ in bad)
+    assert "without a credit" in paused.reason
     assert refusal is NoReply.NO_SERVER
     assert forged is NoReply.NO_SERVER
     assert ledger.balance == 0
