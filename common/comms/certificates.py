@@ -114,7 +114,7 @@ def refusal(endpoint: str, files: Files) -> str:
         ):
             link.recv(
                 1
-            )  # the hub judges this certificate after the handshake; it says nothing if it takes it
+            )  # after the handshake the hub judges this certificate; silence means that it takes it
     except ssl.SSLCertVerificationError as error:
         return f"the hub's certificate is refused: {error.verify_message}"
     except ssl.SSLError as error:

@@ -75,6 +75,11 @@ class LinkConfig(BaseModel):
                 f"endpoint {self.endpoint} with {f'--tls {self.tls}' if self.tls else 'no folder of certificates'}; "
                 "allowed: an endpoint tls/... with --tls DIR, any other without"
             )
+        if self.tls and self.peers:
+            raise ValueError(
+                f"peers {','.join(self.peers)} with --tls {self.tls}; allowed: one hub, since its rules would drop "
+                "what another router passes on"
+            )
         return self
 
 

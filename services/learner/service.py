@@ -85,7 +85,10 @@ class LearnerService:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
-        self._endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
+        endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
+        self._link = f"--endpoint {endpoint}" + (
+            f" --tls {config.tls}" if config.tls else ""
+        )  # flags for others
         self._folder = RunFolder.of(config.run, config.folder)
         if not config.resume and checkpoint.checkpoints(self._folder.checkpoints):
             raise RunExistsError(
@@ -185,13 +188,13 @@ class LearnerService:
         config = self._config
         log.info(
             "%s endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
-            "--run %s --endpoint %s (and rallies with: python -m services.generator --run %s --endpoint %s)",
+            "--run %s %s (and rallies with: python -m services.generator --run %s %s)",
             "listening" if config.mode == "hub" else "connected",
             config.endpoint,
             config.run,
             self.training.progress.epoch,
             config.curriculum.epochs,
-            *(config.run, self._endpoint) * 2,
+            *(config.run, self._link) * 2,
         )
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
@@ -472,10 +475,10 @@ class LearnerService:
         actors = sum(role == "actor" for role, _, _ in self._alive)
         if actors == 0:
             log.warning(
-                "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s --endpoint %s",
+                "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s %s",
                 now - since,
                 self._config.run,
-                self._endpoint,
+                self._link,
             )
         else:
             log.warning(

@@ -58,6 +58,11 @@ def test_with_tls_links_are_mutual_and_the_hub_applies_the_roles():
     assert settings["access_control"]["default_permission"] == "deny"
 
 
+def test_a_hub_that_applies_roles_has_no_peers():
+    with pytest.raises(ValidationError, match=r"peers tls/b:1 with --tls certs; allowed: one hub"):
+        ZenohConfig(endpoint="tls/a:1", tls="certs", peers=("tls/b:1",))
+
+
 @pytest.mark.parametrize("bad", [{"endpoint": "tls/site:7447"}, {"tls": "certs"}])
 def test_a_tls_endpoint_and_only_that_needs_certificates(bad):
     with pytest.raises(
