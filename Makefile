@@ -36,10 +36,10 @@ report: $(STAMP)          ## compare runs: make report RUN="night other" [OUT=ru
 	$(BIN)/topspin report $(RUN) $(if $(OUT),--out $(OUT))
 
 test: $(STAMP)            ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 test-fast: $(STAMP)       ## unit and contract tests
-	$(BIN)/python -m pytest tests/unit tests/contract
+	$(BIN)/python -m pytest tests/unit tests/contract -n auto --maxprocesses 4 --dist worksteal
 
 check: $(STAMP)           ## format, lint, types, layers
 	$(BIN)/ruff format --check .

@@ -21,6 +21,7 @@ from common.policy.folder import load_policy
 from common.service.log import set_up_logging
 from common.service.process import DONE, INTERRUPTED, run_service
 from common.service.run_folder import RunFolder
+from common.service.whole_file import write_whole
 from deploy.panel import View, render
 from deploy.prepare import PreparedRun, RunFailedError, last_epoch, open_link, prepared, settings
 from deploy.supervisor import Supervisor
@@ -192,8 +193,8 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
     if run.config.evaluate and not stop.is_set():
         line |= final_measures(run, stop)
     text = json.dumps(line) + "\n"
-    run.folder.final.write_text(text, encoding="utf-8")
     sys.stdout.write(text)
+    write_whole(run.folder.final, text)
     if stop.is_set():
         log.warning("stopped before its end; go on with: %s", again)
         return INTERRUPTED

@@ -66,10 +66,14 @@ class PreparedRun:
             """Return the flag to go on from the newest checkpoint, if there is one."""
             return ("--resume",) if any(self.folder.checkpoints.glob("*.safetensors")) else ()
 
+        def newest_checkpoint() -> str:
+            """Return the name of the newest checkpoint, or ""."""
+            return max((path.name for path in self.folder.checkpoints.glob("*.safetensors")), default="")
+
         # The learner holds the run's state: the run ends when it is done. A run that was stopped before its first
         # checkpoint starts from the beginning.
         learner = service("learner", 0, *(resumed() if config.resume else ()))
-        found = [replace(learner, keeps_run=True, again=resumed)]
+        found = [replace(learner, keeps_run=True, again=resumed, made=newest_checkpoint)]
         if config.evaluate:
             found.append(service("evaluator", 0))
         found += [service("generator", i, "--index", str(i)) for i in range(config.generators)]

@@ -38,6 +38,7 @@ class Spec:
     restart: bool  # whether it comes back when it dies
     keeps_run: bool = False  # whether the run ends with it: when it is done, or when restarts do not help
     again: Callable[[], tuple[str, ...]] = lambda: ()  # more flags of a restart
+    made: Callable[[], str] = lambda: ""  # names the newest thing that lasts, such as a checkpoint
 
 
 def next_start(spec: Spec, status: int, life_s: float, deaths: int) -> float | None:
@@ -58,6 +59,21 @@ def next_start(spec: Spec, status: int, life_s: float, deaths: int) -> float | N
     return restart_pause(deaths)
 
 
+def is_a_new_row(spec: Spec, status: int, life_s: float, has_made: bool) -> bool:
+    """Return whether a death is the first of a row: the process had worked.
+
+    Args:
+        spec: The process.
+        status: Its exit status; negative: the signal that ended it.
+        life_s: How long it lived [s].
+        has_made: Whether it made something that lasts.
+    """
+    if not spec.keeps_run:
+        return life_s > STABLE_S
+    # A fault of its own would come back after each checkpoint; what kills it from outside need not
+    return life_s > KEEPER_STABLE_S or (status < 0 and has_made)
+
+
 def restart_pause(deaths: int) -> float:
     """Return how long to wait before a process that died ``deaths`` times in a row is started again [s]."""
     return min(RESTART_PAUSE_S * 2.0 ** max(deaths - 1, 0), RESTART_PAUSE_MAX_S)
@@ -75,6 +91,7 @@ class Child:
     restart_at: float | None = None
     exits: list[int] = field(default_factory=list)
     has_ended: bool = False  # it is not started again
+    made: str = ""  # what the last life had made at its end
 
 
 class Supervisor:
@@ -125,8 +142,9 @@ class Supervisor:
         """Record that a process has ended, and when it is started again."""
         child.exits.append(status)
         life_s = now - child.started
-        is_stable = life_s > (KEEPER_STABLE_S if child.spec.keeps_run else STABLE_S)
-        child.deaths_in_a_row = 1 if is_stable else child.deaths_in_a_row + 1
+        before, child.made = child.made, child.spec.made()
+        is_new = is_a_new_row(child.spec, status, life_s, child.made != before)
+        child.deaths_in_a_row = 1 if is_new else child.deaths_in_a_row + 1
         pause = next_start(child.spec, status, life_s, child.deaths_in_a_row)
         if pause is None:
             child.has_ended = True

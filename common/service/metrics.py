@@ -133,6 +133,7 @@ METRICS: Final = _table(
         "Time of the newest checkpoint; before the first one, start of the learner",
         (_L,),
     ),
+    Metric("topspin_failed_saves_total", "counter", "1", "Checkpoints that could not be written", (_L,)),
     # rollouts
     Metric("topspin_rollouts_published_total", "counter", "rollouts", "Rollouts numbered", (_A,)),
     Metric(

@@ -8,6 +8,7 @@
 ==  ==========================================================================
 """
 
+import errno
 import logging
 import math
 import os
@@ -39,6 +40,11 @@ STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ReportedError: FAILED,
 }
 
+# Faults of the machine and not of the program, also where the error names no file.
+MACHINE_FAULTS: Final = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE}
+)
+
 SECOND_SIGNAL_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 15.0}
 """Time after the first signal from which on another one ends the process at once [s]. A second Ctrl-C is a person's
 decision. A second SIGTERM may repeat the first one and must not interrupt the last checkpoint: a service manager
@@ -64,6 +70,13 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
     except tuple(STATUS_OF_ERROR) as error:
         sys.stderr.write(f"{prog}: {error}\n")
         status = next(code for kind, code in STATUS_OF_ERROR.items() if isinstance(error, kind))
+    except OSError as error:
+        if error.filename is None and error.errno not in MACHINE_FAULTS:
+            log.exception("stopped by a bug")
+        else:
+            where = f"{error.filename}: " if error.filename is not None else ""
+            sys.stderr.write(f"{prog}: {where}{error.strerror}\n")
+        status = FAILED
     except Exception:
         log.exception("stopped by a bug")
         status = FAILED

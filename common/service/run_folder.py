@@ -36,7 +36,7 @@ def whole_rows(path: Path) -> list[dict[str, str]]:
     """
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
         lines = [line for line in file if line.endswith("\n")]
     return [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
 

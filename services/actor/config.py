@@ -42,6 +42,9 @@ class ActorOptions(BaseModel):
         description="idle time after which the log says what the actor waits for",
         json_schema_extra={"unit": "s"},
     )
+    history: str = Field(
+        "", description="folder for a history: a line for each event of a rollout; empty: none"
+    )
 
 
 class ActorConfig(ServiceConfig, Fleet, ActorOptions):

@@ -1,6 +1,7 @@
 """The actor's shell: receives policies and rallies, plays, and sends rollouts until each has its verdict."""
 
 import logging
+import os
 import time
 from threading import Event
 
@@ -14,6 +15,7 @@ from common.comms.messages import (
 )
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.policy.contract import PolicyError
+from common.service.history import History
 from common.service.member import Member
 from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
@@ -46,6 +48,8 @@ class ActorService:
     def __init__(self, config: ActorConfig, transport: Transport, metrics: Metrics, incarnation: int) -> None:
         self._config, self._transport, self._metrics = config, transport, metrics
         self._member = Member("actor", config, transport, metrics, incarnation)
+        self._history = History(config.history, f"actor-{config.id}")
+        self._history.note("start", actor=config.id, incarnation=incarnation, process=os.getpid())
         self._keys = keys = self._member.keys
         self._stop = Event()
         self._feed = RallyFeed(config, transport, self._member, self._is_stopping)
@@ -112,7 +116,7 @@ class ActorService:
         self._note_learners()
         self._take_policies(now)
         self._take_verdicts(now)
-        self._outbox = box.expired(self._outbox, now)
+        self._drop_old(now)
         self._send(now)
         reason = self._idle_reason(now)
         if not reason:
@@ -154,6 +158,8 @@ class ActorService:
             log.warning("the learner did not answer the last report")
         self._beat()
         self._member.leave()
+        self._history.note("end", in_flight=[flight.sequence for flight in self._outbox.flights])
+        self._history.close()
 
     # ---- what to do
 
@@ -182,6 +188,9 @@ class ActorService:
     def _play(self, now: float) -> None:
         rollout = self._player.play(self._config.id, self._member.incarnation, self._outbox.next_sequence)
         played = time.monotonic()
+        self._history.note(
+            "played", number=rollout.sequence, generation=rollout.generation, version=rollout.version
+        )
         self._outbox = box.offer(self._outbox, encode(rollout), played)
         self._frames += rollout.rewards.size
         self._metrics.inc("topspin_frames_total", rollout.rewards.size)
@@ -293,6 +302,12 @@ class ActorService:
         self._following = adopted(self._following, snapshot.generation)
         # The learner needs new rollouts of a new version: report at once to get credits
         self._next_report = 0.0
+        self._history.note(
+            "policy",
+            generation=snapshot.generation,
+            version=snapshot.version,
+            stage_number=snapshot.stage_number,
+        )
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.set("topspin_stage", snapshot.stage)
         if (
@@ -313,6 +328,7 @@ class ActorService:
         for flight in box.due(self._outbox, now):
             if flight.tries:
                 self._metrics.inc("topspin_rollouts_retried_total", 1.0)
+            self._history.note("sent", number=flight.sequence, tries=flight.tries + 1)
             self._pending[flight.sequence] = self._transport.request(
                 self._keys.rollout(self._config.id),
                 flight.payload,
@@ -334,7 +350,7 @@ class ActorService:
                 continue
             before = self._outbox.counts
             self._outbox = box.answered(self._outbox, sequence, verdict, now)
-            self._count(before, verdict)
+            self._count(sequence, before, verdict)
         if self._report is not None and (outcome := self._report.poll()) is not None:
             self._report = None
             verdict = self._verdict(outcome)
@@ -369,11 +385,23 @@ class ActorService:
             self._member.refuse("verdict", error)
             return None
 
-    def _count(self, before: box.Counts, verdict: Verdict) -> None:
+    def _drop_old(self, now: float) -> None:
+        before = len(self._outbox.dropped)
+        self._outbox = box.expired(self._outbox, now)
+        for sequence in self._outbox.dropped[before:]:
+            self._history.note("dropped", number=sequence)
+
+    def _count(self, sequence: int, before: box.Counts, verdict: Verdict) -> None:
         after = self._outbox.counts
-        if after.accepted > before.accepted:
+        is_accepted = after.accepted > before.accepted
+        is_refused = sum(after.refused.values()) > sum(before.refused.values())
+        if is_accepted or is_refused:
+            self._history.note(
+                "verdict", number=sequence, kind=verdict.first.value, generation=verdict.generation
+            )
+        if is_accepted:
             self._metrics.inc("topspin_rollouts_accepted_total", 1.0)
-        elif sum(after.refused.values()) > sum(before.refused.values()):
+        elif is_refused:
             self._metrics.inc("topspin_rollouts_refused_total", 1.0, reason=verdict.first.value)
             log.warning("rollout refused kind=%s reason=%r", verdict.first.value, verdict.reason)
 

@@ -1,6 +1,5 @@
 """The evaluator's shell: follows a run, plays fixed rallies with its newest policy, keeps the best."""
 
-import csv
 import logging
 import time
 from collections.abc import Callable
@@ -18,6 +17,7 @@ from common.policy.weights import install, new_network
 from common.service.member import Member
 from common.service.metrics import Metrics
 from common.service.run_folder import RunFolder
+from common.service.table import Table
 from common.task.observation import critic_layout
 from services.evaluator.best import is_comparable, match_of, score
 from services.evaluator.config import EvaluatorConfig
@@ -62,6 +62,7 @@ class EvaluatorService:
         self._contract_hash = contract_hash(config.task, config.network)
         self._folder = RunFolder.of(config.run, config.folder)
         self._folder.report.mkdir(parents=True, exist_ok=True)
+        self._curve = Table(self._folder.evaluations, CURVE)
         self._task = config.task.model_copy(update={"rounds": config.rounds})
         self._rallies = evaluation_rallies(config.rallies, self._task, config.seed)
         self._played = (-1, -1)
@@ -163,9 +164,12 @@ class EvaluatorService:
         self._report(snapshot, found, self._clock() - started)
         reached = score(snapshot.stage, found)
         if self._best is None or reached > self._best:
-            self._best = reached
             measured = contract.model_copy(update={"measures": found | {"match": match_of(config)}})
-            save_policy(self._folder.best_policy, policy.network, policy.moments, measured)
+            try:
+                save_policy(self._folder.best_policy, policy.network, policy.moments, measured)
+                self._best = reached
+            except OSError as error:
+                log.error("can't write policy=%s reason=%s", self._folder.best_policy, error.strerror)
 
     def _report(self, snapshot: PolicySnapshot, found: dict[str, Any], seconds: float) -> None:
         """Write an evaluation to log, curve, heartbeat and metrics."""
@@ -180,7 +184,7 @@ class EvaluatorService:
             seconds,
         )
         where = {"version": snapshot.version, "frames": snapshot.frames, "stage": snapshot.stage}
-        self._append(found | where | {"seconds": round(self._clock() - self._born, 1)})
+        self._curve.append(found | where | {"seconds": round(self._clock() - self._born, 1)})
         self._last = {name: float(found[name]) for name in _RATES if found.get(name) is not None}
         self._last |= {"frames": float(snapshot.frames), "stage": float(snapshot.stage)}
         for metric, name in (
@@ -194,12 +198,3 @@ class EvaluatorService:
         self._metrics.set("topspin_policy_version", snapshot.version)
         self._metrics.inc("topspin_phase_seconds_total", seconds, phase="evaluate")
         self._metrics.inc("topspin_episodes_total", found["rallies"])
-
-    def _append(self, values: dict[str, Any]) -> None:
-        path = self._folder.evaluations
-        is_new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=CURVE, extrasaction="ignore")
-            if is_new:
-                writer.writeheader()
-            writer.writerow(values)

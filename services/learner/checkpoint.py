@@ -5,6 +5,7 @@ wait at a planned stop. The rest, `Progress` and what the service adds (stage lo
 metadata. Every tensor and the JSON have a checksum, so a damaged file is told from one of other settings.
 """
 
+import errno
 import json
 import logging
 import os
@@ -63,7 +64,11 @@ class Extras:
 
 
 def save(folder: Path, training: Training, extras: Extras) -> Path:
-    """Write ``folder``/VERSION.safetensors and return it; a crash at any moment leaves whole files only."""
+    """Write ``folder``/VERSION.safetensors and return it; a crash at any moment leaves whole files only.
+
+    Raises:
+        OSError: It can't be written; the older ones are as they were.
+    """
     tensors: dict[str, npt.NDArray[Any]] = {
         _NETWORK + name: value for name, value in state_tensors(training.network).items()
     }
@@ -92,7 +97,11 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     path = folder / f"{training.progress.version:08d}{SUFFIX}"
     part = path.with_suffix(".part")
     text = json.dumps(about)
-    save_file(tensors, part, metadata={"topspin": text, "checksum": str(zlib.crc32(text.encode()))})
+    try:
+        save_file(tensors, part, metadata={"topspin": text, "checksum": str(zlib.crc32(text.encode()))})
+    except SafetensorError as error:  # a full disk, in words
+        part.unlink(missing_ok=True)
+        raise OSError(errno.EIO, str(error), str(part)) from None
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, path)

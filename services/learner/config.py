@@ -39,6 +39,9 @@ class LearnerOptions(BaseModel):
         description="time without a dataset after which the log says what is missing",
         json_schema_extra={"unit": "s"},
     )
+    history: str = Field(
+        "", description="folder for a history: a line for each event of a rollout; empty: none"
+    )
 
 
 class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):

@@ -328,13 +328,14 @@ class Intake:
         self._in_update = tuple(self._queue.popleft() for _ in range(self._config.dataset_rollouts))
         return self._in_update
 
-    def finish_update(self, learner: LearnerState) -> None:
-        """Record the dataset as trained; waiting rollouts that the new version can't use are lost."""
+    def finish_update(self, learner: LearnerState) -> tuple[Queued, ...]:
+        """Record the dataset as trained; return the waiting rollouts that the new version can't use: they are lost."""
         for entry in self._in_update:
             self._settle(entry, Fate.TRAINED)
         self._in_update = ()
         self._learner_state = learner
         waiting, self._queue = self._queue, deque()
+        lost = []
         for entry in waiting:
             stays = entry.header.stage_number == learner.stage_number and (
                 self._version_at_use() - entry.header.version <= self._config.max_lag
@@ -343,6 +344,8 @@ class Intake:
                 self._queue.append(entry)
             else:
                 self._settle(entry, Fate.LOST)
+                lost.append(entry)
+        return tuple(lost)
 
     def ledgers(self) -> dict[tuple[str, int], Ledger]:
         """Return the account of every (actor, incarnation)."""

@@ -1,15 +1,21 @@
 """A run's log: one row per epoch, in metrics.csv and as TensorBoard events."""
 
-import csv
+import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from common.service.table import Table
+from common.service.whole_file import write_whole
 from common.task.reward import TERMS
 from common.task.states import Outcome
 from services.learner.epoch_stats import EpochStats
 
 if TYPE_CHECKING:
     from tensorboard.summary.writer.event_file_writer import EventFileWriter
+
+
+log = logging.getLogger(__name__)
 
 
 def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, float]:
@@ -61,23 +67,22 @@ class RunLog:
 
     def __init__(self, metrics: Path, tensorboard: Path) -> None:
         self._path = metrics
+        self._table: Table | None = None
         self._tensorboard = tensorboard
         self._events: EventFileWriter | None = None
 
     def append(self, values: dict[str, float]) -> None:
         """Write one epoch's row."""
-        is_new = not self._path.exists() or self._path.stat().st_size == 0
-        with self._path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(values))
-            if is_new:
-                writer.writeheader()
-            writer.writerow(
-                {
-                    name: f"{value:.6g}" if isinstance(value, float) else value
-                    for name, value in values.items()
-                }
-            )
-        self._write_events(values)
+        if self._table is None:
+            self._table = Table(self._path, list(values))
+        self._table.append(
+            {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
+        )
+        try:
+            self._write_events(values)
+        except OSError as error:
+            self._events = None  # its thread has ended: the next epoch begins another file
+            log.error("can't write folder=%s reason=%s", self._tensorboard, error.strerror)
 
     def truncate(self, epoch: int) -> None:
         """Drop rows after ``epoch``: epochs that a resumed run trains again."""
@@ -88,12 +93,13 @@ class RunLog:
         # a learner that was killed may have left an incomplete line at the end
         rows = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",", 1)[0]) <= epoch]
         kept = lines[:1] + rows
-        self._path.write_text("".join(kept))
+        write_whole(self._path, "".join(kept))
 
     def close(self) -> None:
         """Write TensorBoard's buffer."""
         if self._events is not None:
-            self._events.close()
+            with suppress(OSError):
+                self._events.close()
 
     def _write_events(self, values: dict[str, float]) -> None:
         # Imported late: it takes a second, and the first batch should not wait for it.

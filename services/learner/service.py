@@ -3,14 +3,14 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from threading import Event
 from typing import Final
 
 from common.comms.codec import DecodeError, decode, encode
 from common.comms.keys import KeyPartError
-from common.comms.messages import ActorReport, Rollout, StageChange, Verdict
+from common.comms.messages import ActorReport, StageChange, Verdict
 from common.comms.transport import Request, Transport
 from common.comms.zenoh_config import endpoint_for_others
 from common.env.robot import home_action
@@ -19,6 +19,7 @@ from common.errors import ReportedError
 from common.policy.contract import Contract, contract_hash, contract_of, training_hash
 from common.policy.folder import save_policy
 from common.service.config import save_settings, to_tables
+from common.service.history import History
 from common.service.member import LEARNER_ID, Member
 from common.service.metrics import Metrics
 from common.service.run_folder import RunFolder
@@ -50,6 +51,10 @@ class RunExistsError(ReportedError):
 
 class LearnerAliveError(ReportedError):
     """The run has another learner."""
+
+
+class NotSavedError(ReportedError):
+    """The run folder can't be written."""
 
 
 class DivergedError(ReportedError):
@@ -149,6 +154,8 @@ class LearnerService:
         self._joined = clock()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
+        self._history = History(config.history, "learner-0")
+        self._history.note("start", **self._where(), waiting=_lives(self._intake.waiting))
 
     # ---- state
 
@@ -210,6 +217,8 @@ class LearnerService:
             self._beat()
             self._run_log.close()
             self._member.leave()
+            self._history.note("end", trained=self.ledger().trained, balance=self.ledger().balance)
+            self._history.close()
         progress = self.training.progress
         log.info("stopped epoch=%d frames=%d stage=%d", progress.epoch, progress.frames, progress.stage)
 
@@ -221,7 +230,7 @@ class LearnerService:
         if dataset:
             # by number, not by arrival, so that a run with one actor is the same bit for bit on any network
             ordered = sorted(dataset, key=lambda entry: (entry.header.actor, entry.header.sequence))
-            self._train([entry.rollout for entry in ordered])
+            self._train(ordered)
             trained = True
         now = self._clock()
         if not trained:
@@ -237,9 +246,24 @@ class LearnerService:
     def save(self, is_last: bool = False) -> None:
         """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
 
+        Where that fails, such as on a full disk, training goes on, and the next one is tried in its time.
+
         Args:
             is_last: Whether this process trains no more. Then the checkpoint also keeps the rollouts that wait.
+
+        Raises:
+            NotSavedError: The last state can't be saved.
         """
+        try:
+            self._save(is_last)
+        except OSError as error:
+            self._metrics.inc("topspin_failed_saves_total")
+            text = f"epoch {self.training.progress.epoch} can't be saved in {self._folder.root}: {error.strerror}"
+            if is_last:
+                raise NotSavedError(f"{text}; what an earlier checkpoint holds is kept") from None
+            log.error("%s; training goes on, next try in %.0f s", text, self._config.checkpoint_interval_s)
+
+    def _save(self, is_last: bool) -> None:
         if not self.training.is_finite:
             log.error("not saved: parameters are not finite epoch=%d", self.training.progress.epoch)
             return
@@ -258,14 +282,15 @@ class LearnerService:
         weights = self.training.weights(self._config.evaluated_weights)
         save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
+        self._history.note("saved", **self._where(), waiting=_lives(self._intake.waiting) if is_last else [])
         log.debug("checkpoint written file=%s", path)
 
     # ---- training
 
-    def _train(self, rollouts: Sequence[Rollout]) -> None:
+    def _train(self, dataset: Sequence[Queued]) -> None:
         self._member.state = "training"
         started = self._clock()
-        stats = self.training.run_epoch(rollouts, self._serve)
+        stats = self.training.run_epoch([entry.rollout for entry in dataset], self._serve)
         clocks, now = self._clocks, self._clock()
         if clocks.first_trained < 0:
             clocks.first_trained = now
@@ -274,7 +299,8 @@ class LearnerService:
             self._broadcast.note_stage("curriculum")
         if stats.diverged:
             self._go_back(stats.diverged)
-        self._intake.finish_update(self._learner_state())
+        lost = self._intake.finish_update(self._learner_state())
+        self._history.note("trained", **self._where(), rollouts=_lives(dataset), lost=_lives(lost))
         self._broadcast.publish_policy()
         if stats.stage_changed:
             self._broadcast.publish_stage()
@@ -306,6 +332,16 @@ class LearnerService:
         self.training.go_back(lambda training: checkpoint.restore(path, training))
         self._metrics.inc("topspin_rollbacks_total")
         log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
+
+    def _where(self) -> dict[str, int]:
+        """Return what the history says of the training with each event."""
+        progress = self.training.progress
+        return {
+            "generation": self._generation,
+            "version": progress.version,
+            "epoch": progress.epoch,
+            "stage_number": progress.stage_number,
+        }
 
     def _learner_state(self) -> LearnerState:
         progress = self.training.progress
@@ -409,7 +445,14 @@ class LearnerService:
             return self._intake.unreadable(fault)
         if header.fault:
             self._member.refuse("rollout", f"actor={header.actor} {header.fault}")
-        return self._intake.arrive(header, rollout, now)
+        verdict = self._intake.arrive(header, rollout, now)
+        self._history.note(
+            "verdict",
+            rollout=[*header.life, header.sequence],
+            kind=verdict.kind.value,
+            generation=self._generation,
+        )
+        return verdict
 
     def _answer_report(self, request: Request, now: float) -> None:
         try:
@@ -517,3 +560,8 @@ class LearnerService:
             self._last | {"misfits": len(self._intake.misfits)},
         )
         self._member.beat(counters, gauges)
+
+
+def _lives(entries: Iterable[Queued]) -> list[tuple[str, int, int]]:
+    """Return the name of each rollout in a history: actor, incarnation, number."""
+    return [(*entry.header.life, entry.header.sequence) for entry in entries]

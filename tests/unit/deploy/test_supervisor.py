@@ -12,6 +12,7 @@ from deploy.supervisor import (
     RESTART_PAUSE_S,
     Spec,
     Supervisor,
+    is_a_new_row,
     next_start,
     restart_pause,
 )
@@ -52,6 +53,21 @@ KEEPER = Spec("learner-0", "learner", ("m",), restart=True, keeps_run=True)
 )
 def test_a_dead_process_is_restarted_where_that_can_help(spec, status, life_s, deaths, pause):
     assert next_start(spec, status, life_s, deaths) == pause
+
+
+@pytest.mark.parametrize(
+    ("spec", "status", "life_s", "has_made", "is_new"),
+    [
+        (WORKER, -9, 19.0, False, False),
+        (WORKER, -9, 21.0, False, True),
+        (KEEPER, -9, 30.0, True, True),  # killed from outside, after a checkpoint: the run has gone on
+        (KEEPER, -9, 30.0, False, False),
+        (KEEPER, 1, 30.0, True, False),  # a fault of its own would come back for ever
+        (KEEPER, 1, 601.0, False, True),
+    ],
+)
+def test_a_death_after_useful_work_begins_a_new_row(spec, status, life_s, has_made, is_new):
+    assert is_a_new_row(spec, status, life_s, has_made) is is_new
 
 
 def test_an_assignment_survives_the_pipe():

@@ -69,7 +69,11 @@ def test_a_stopped_process_is_told_from_a_busy_one():
         processes = [("learner-0", os.getpid(), 0.0), ("busy", busy.pid, 0.0), ("stopped", stopped.pid, 0.0)]
         heard = {"learner-0": 11.0}
         watchdog.look(processes, heard, 6.0)
-        time.sleep(1.0)  # [s] of CPU time for the busy one; the watchdog's clock says 5.5
+        begin, deadline = cpu_seconds(busy.pid), time.monotonic() + 30.0
+        while (
+            cpu_seconds(busy.pid) - begin < 0.5 and time.monotonic() < deadline
+        ):  # the watchdog's clock says 5.5 s
+            time.sleep(0.05)
         found = watchdog.look(processes, heard, 6.0 + LOOK_S + 0.5)
     finally:
         for process in (busy, stopped):

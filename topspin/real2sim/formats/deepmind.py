@@ -26,7 +26,7 @@ def read_json(path: Path, turn: bool) -> Recordings:
         entries = json.loads(path.read_bytes())
     except json.JSONDecodeError as error:
         raise RecordingError(f"{path}:{error.lineno}: not readable as JSON: {error.msg}") from None
-    except (UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # no text, or numbers and nesting beyond Python's limits
         raise RecordingError(f"{path}: not readable as JSON: {error}") from None
     if not isinstance(entries, list):
         raise RecordingError(f"{path}: got a {type(entries).__name__}; allowed: a list of states")
@@ -57,5 +57,10 @@ def _row(entry: dict[str, object], path: Path) -> list[float]:
         value = entry.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise RecordingError(f"{path}: id {entry['id']}: {name}: got {value!r}; allowed: a number")
-        row.append(float(value))
+        try:
+            row.append(float(value))
+        except OverflowError:
+            raise RecordingError(
+                f"{path}: id {entry['id']}: {name}: got {str(value)[:20]}...; allowed: a float"
+            ) from None
     return row

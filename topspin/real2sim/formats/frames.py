@@ -130,7 +130,7 @@ def read_frame(path: Path) -> Frame:
         return world_frame()
     try:
         table = tomllib.loads(sidecar.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not TOML, no text, or beyond Python's limits
         raise RecordingError(f"{sidecar}: not readable as TOML: {error}") from None
     return _frame(table, sidecar)
 

@@ -1,0 +1,5 @@
+"""Bytes that nobody meant: every decoder and every file reader gets them, and may only refuse.
+
+* ``targets``: what reads bytes, with valid examples and the error that refuses: one table
+* ``__main__``: one process for each target, in which Atheris looks for inputs that reach new lines of code
+"""
