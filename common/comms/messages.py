@@ -230,7 +230,7 @@ class Verdict:
     # Flow control by an absolute limit: a lost or repeated answer changes nothing.
     credit_limit: Count  # the actor may publish sequence numbers less than this ...
     credit_version: Count  # ... if this version or a later one played them
-    report_after_s: Annotated[float, Wire("s", low=0, high=3600)] = (
+    report_after_s: Annotated[float, Wire("s", low=0, high=64)] = (
         0.25  # pause of an idle actor between reports
     )
 

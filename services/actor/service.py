@@ -72,6 +72,7 @@ class ActorService:
         self._asked: PendingReply | None = None
         self._next_ask = self._next_report = 0.0
         self._report_after_s = REPORT_INTERVAL_S
+        self._known_credits = (0, 0, 0)  # generation, limit and version of the credits at the last report
         self._reported = (0, 0)  # generation and version of the policy in the last report
         self._following = Following()
         self._is_doubted = False  # whether the policy is not the learner's, though it has its generation
@@ -355,7 +356,9 @@ class ActorService:
             self._report = None
             verdict = self._verdict(outcome)
             if verdict is not None:
-                self._outbox = box.credited(self._outbox, verdict)
+                generation, limit, version = self._known_credits
+                known = (limit, version) if generation == verdict.generation else (0, 0)
+                self._outbox = box.credited(self._outbox, verdict, known)
                 self._heed(verdict)
 
     def _heed(self, verdict: Verdict) -> None:
@@ -417,6 +420,8 @@ class ActorService:
             leaving=leaving,
         )
         self._reported = (snapshot.generation, snapshot.version) if snapshot else (0, 0)
+        outbox = self._outbox
+        self._known_credits = (outbox.generation, outbox.credit_limit, outbox.credit_version)
         return self._transport.request(
             self._keys.report(self._config.id), encode(report), timeout_s, Flow.CONTROL
         )

@@ -31,6 +31,7 @@ _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
 
 IDLE_REPORTS_HZ: Final = 16.0  # reports of all waiting actors together: 2 % of a core (benchmarks.idle)
 SOONEST_REPORT_S: Final = 0.25  # pause between reports of a small fleet
+LATEST_REPORT_S: Final = 64.0  # of one of more than 1,000 actors
 FREE_REFUSALS: Final = 2  # in a row: a stage change or a restart costs an actor as many as it has in flight
 LONGEST_PAUSE_S: Final = 60.0  # without credits, after many refusals in a row
 FOLD_AFTER_S: Final = 600.0  # a life that a newer one of the same actor has replaced
@@ -194,7 +195,7 @@ class Intake:
     @property
     def report_after_s(self) -> float:
         """Pause between two reports of a waiting actor [s]: all together send `IDLE_REPORTS_HZ`."""
-        return max(SOONEST_REPORT_S, len(self._living) / IDLE_REPORTS_HZ)
+        return min(max(SOONEST_REPORT_S, len(self._living) / IDLE_REPORTS_HZ), LATEST_REPORT_S)
 
     def take_new_misfits(self) -> list[Misfit]:
         """Return the misfits that were found since the last call, each life of an actor once."""
