@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from threading import Event
 
+from common.comms.roles import name_of
 from common.comms.transport import Transport
 from common.comms.zenoh_transport import open_zenoh
 from common.service.log import set_up_logging
@@ -23,5 +24,6 @@ def connected(role: str, config: ServiceConfig, stop: Event) -> Iterator[tuple[T
     set_up_logging(config.log_level, f"{role}/{config.id}")
     with closing(Metrics(role, config.id)) as metrics:
         metrics.serve(config.metrics_port, config.metrics_host)
-        with closing(open_zenoh(config, stop)) as transport:
+        name = name_of(role, config.id)
+        with closing(open_zenoh(config, stop, name=name, run=config.run)) as transport:
             yield transport, metrics
