@@ -27,7 +27,6 @@ from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
-from common.service.member import LEARNER_ID
 from common.service.process import DONE
 from deploy.prepare import free_endpoint
 
@@ -40,6 +39,7 @@ START_S = 60.0
 class Sender:
     """One actor that waits."""
 
+    actor: str
     report: bytes
     transport: Transport
     next_report: float = 0.0
@@ -66,7 +66,7 @@ class Senders:
                     sender.next_report = now + sender.after_s
             if sender.pending is None and now >= sender.next_report:
                 sender.next_report = now + sender.after_s
-                key = self.keys.ctl("learner", LEARNER_ID)
+                key = self.keys.report(sender.actor)
                 sender.pending = sender.transport.request(key, sender.report, 5.0, Flow.CONTROL)
 
 
@@ -106,7 +106,7 @@ def measure(config: IdleConfig, endpoint: str, process: psutil.Process, stop: Ev
                 RUN, f"a{number}", 1, 0, 0, (), (), 0, (), leaving=False, training_hash=matching
             )
             transport.declare_alive(keys.alive("actor", f"a{number}", 1))
-            senders.all.append(Sender(encode(report), transport))
+            senders.all.append(Sender(report.actor, encode(report), transport))
 
         def work(seconds: float) -> None:
             until = time.monotonic() + seconds

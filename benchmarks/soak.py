@@ -26,14 +26,13 @@ from pydantic import Field
 from scipy.stats import theilslopes
 
 from benchmarks.settings import BenchmarkConfig, print_figures, run
-from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from common.service.run_folder import whole_rows
 from deploy.config import DeployConfig
-from deploy.prepare import PreparedRun, prepared
+from deploy.prepare import PreparedRun, open_link, prepared
 from deploy.supervisor import Supervisor
 
 log = logging.getLogger(__name__)
@@ -104,7 +103,7 @@ def watch(run: PreparedRun, config: SoakConfig, stop: Event) -> dict[str, Any]:
     supervisor = Supervisor(run.specs(), run.folder.logs)
     transport = None
     try:
-        transport = open_zenoh(run.link, stop)
+        transport = open_link(run, stop)
         series: dict[str, Series] = {}
 
         def work(seconds: float, samples: bool) -> None:

@@ -19,13 +19,12 @@ from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.comms.codec import decode
 from common.comms.keys import Keys
 from common.comms.messages import Status
-from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from common.service.process import DONE
 from common.service.run_folder import LATEST, RUNS, whole_rows
 from deploy.config import DeployConfig
-from deploy.prepare import PreparedRun, prepared
+from deploy.prepare import PreparedRun, open_link, prepared
 from deploy.supervisor import Supervisor
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
@@ -43,7 +42,7 @@ def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> 
     transport = None
     learner: Status | None = None
     try:
-        transport = open_zenoh(run.link, stop)
+        transport = open_link(run, stop)
         statuses = transport.subscribe(Keys(run.name).every_status(), capacity=4096)
 
         def watch(until: float) -> None:

@@ -15,7 +15,6 @@ from rich.live import Live
 
 from common.comms.messages import Status
 from common.comms.transport import Transport, TransportError
-from common.comms.zenoh_transport import open_zenoh
 from common.evaluation.evaluate import StoppedError, check, measure
 from common.evaluation.match import MatchConfig
 from common.policy.folder import load_policy
@@ -24,7 +23,7 @@ from common.service.process import DONE, INTERRUPTED, run_service
 from common.service.run_folder import RunFolder
 from common.service.whole_file import write_whole
 from deploy.panel import View, render
-from deploy.prepare import PreparedRun, RunFailedError, last_epoch, prepared, settings
+from deploy.prepare import PreparedRun, RunFailedError, last_epoch, open_link, prepared, settings
 from deploy.supervisor import Supervisor
 from deploy.targets import TargetsFile
 from deploy.watchdog import Watchdog
@@ -212,7 +211,7 @@ def connect(run: PreparedRun, stop: Event, supervisor: Supervisor) -> Transport 
     """Return a connection to the learner, or None if it ended, or a stop was requested, before it listened."""
     ended = _Ended(stop, supervisor)
     try:
-        return open_zenoh(run.link, ended)
+        return open_link(run, ended)
     except TransportError:
         if ended.is_set():
             return None

@@ -8,12 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import islice
+from threading import Event
 from typing import Final
 
 from pydantic import ValidationError
 
+from common.comms.certificates import checked, files_of
 from common.comms.keys import Keys
+from common.comms.roles import OPERATOR_NAME, name_of
+from common.comms.transport import Transport
 from common.comms.zenoh_config import ZenohConfig
+from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
 from common.service.endpoint import PORTS_TRIED
@@ -129,9 +134,9 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def free_endpoint() -> str:
+def free_endpoint(kind: str = "tcp") -> str:
     """Return a free endpoint on the loopback interface."""
-    return f"tcp/127.0.0.1:{free_port()}"
+    return f"{kind}/127.0.0.1:{free_port()}"
 
 
 def settings(argv: Sequence[str], prog: str) -> DeployConfig:
@@ -183,7 +188,8 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
         )
     metrics_ports(config)  # raises before anything is written
     # A new endpoint each time unless one is set: the old one may be taken.
-    link = link_to_learner(config, config.endpoint or free_endpoint())
+    link = link_to_learner(config, config.endpoint or free_endpoint("tls" if config.tls else "tcp"))
+    check_certificates(config)
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
         before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
@@ -204,18 +210,44 @@ def write(config: DeployConfig, name: str, folder: RunFolder, endpoint: str) -> 
     folder.point_latest_here()
 
 
+def certificate_names(config: DeployConfig) -> tuple[str, ...]:
+    """Return the names of the certificates that a run needs: of its services, and of this process."""
+    services = [name_of(role.name, str(i)) for role in ROLES for i in range(role.count(config))]
+    return (*services, OPERATOR_NAME)
+
+
+def check_certificates(config: DeployConfig) -> None:
+    """Raise an error that names the certificates that a run lacks or can't use; nothing without TLS."""
+    if not config.tls:
+        return
+    missing = [
+        name for name in certificate_names(config) if not files_of(config.tls, name).certificate.exists()
+    ]
+    if missing:
+        names = ",".join(missing)
+        raise ConfigError(
+            f"--tls {config.tls} has no certificate of {names}; make them with: topspin certs --out {config.tls} "
+            f"--add {names}"
+        )
+    for name in certificate_names(config):
+        checked(config.tls, name)
+
+
+def open_link(run: PreparedRun, stop: Event) -> Transport:
+    """Return a connection to a run's learner, as its operator."""
+    return open_zenoh(run.link, stop, name=OPERATOR_NAME, run=run.name)
+
+
 def link_to_learner(config: DeployConfig, endpoint: str) -> ZenohConfig:
     """Return how this process reaches the learner: as its services do.
 
     Raises:
-        ConfigError: TLS needs all of ca, certificate and key, and an endpoint tls/...
+        ConfigError: TLS needs a folder of certificates, and an endpoint tls/...
     """
     try:
         return ZenohConfig(
             endpoint=endpoint,
-            tls_ca=config.tls_ca,
-            tls_certificate=config.tls_certificate,
-            tls_key=config.tls_key,
+            tls=config.tls,
             connect_timeout_s=CONNECT_S,
         )
     except ValidationError as error:

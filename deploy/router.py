@@ -9,9 +9,9 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from threading import Event
-from typing import ClassVar, Final, Literal
+from typing import ClassVar, Final, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
@@ -43,6 +43,12 @@ class RouterConfig(ZenohConfig):
         FIRST_PORT, ge=0, le=65535, description="HTTP port of /metrics, or the next free one; 0: any free one"
     )
     log_level: LogLevel = Field("info", description="lowest level that is logged")
+
+    @model_validator(mode="after")
+    def _is_open(self) -> Self:
+        if self.tls:
+            raise ValueError(f"tls {self.tls}; allowed: none: with TLS the learner is the hub, since it has the rules")
+        return self
 
 
 def main(argv: Sequence[str], stop: Event) -> int:

@@ -3,10 +3,12 @@
 import logging
 from typing import Final
 
+from common.comms.budgets import one_line
 from common.comms.codec import DecodeError, decode
-from common.comms.keys import Keys
+from common.comms.keys import KeyPartError, Keys
 from common.comms.messages import Status
 from common.comms.transport import Transport
+from common.service.member import RefusalLog
 from deploy.panel import STALE_S, View, clock, time_left_s
 
 log = logging.getLogger(__name__)
@@ -23,17 +25,22 @@ class Watcher:
     """
 
     def __init__(self, view: View, transport: Transport) -> None:
-        self._view = view
-        self._statuses = transport.subscribe(Keys(view.run).every_status(), capacity=4096)
+        self._view, self._keys = view, Keys(view.run)
+        self._statuses = transport.subscribe(self._keys.every_status(), capacity=4096)
+        self._refusals = RefusalLog()
         self._next_line = 0.0
 
     def look(self, now: float) -> None:
         """Read the heartbeats that have arrived."""
         for sample in self._statuses.poll():
             try:
-                self._view.hear(decode(sample.payload, Status), now)
-            except DecodeError as error:
-                log.warning("status refused reason=%s", error)
+                status = decode(sample.payload, Status)
+                if sample.key != self._keys.status(status.role, status.id):
+                    raise DecodeError(f"heartbeat of {status.role}/{status.id} on {sample.key}")
+                self._view.hear(status, now)
+            except (DecodeError, KeyPartError) as error:
+                if line := self._refusals.line(one_line(str(error)), now):
+                    log.warning("status refused reason=%s", line)
 
     def line(self, now: float) -> None:
         """Log a line of progress if one is due."""

@@ -55,6 +55,12 @@ def _pictures(argv: Sequence[str], stop: Event) -> int:
     return main(argv, stop)
 
 
+def _certs(argv: Sequence[str], stop: Event) -> int:
+    from topspin.certs import main
+
+    return main(argv, stop)
+
+
 def _release(argv: Sequence[str], stop: Event) -> int:
     from topspin.release import main
 
@@ -83,6 +89,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "real2sim": Command(_real2sim, "play recordings of real balls"),
     "pictures": Command(_pictures, "draw stills of a policy's best rally"),
     "export": Command(_export, "write a policy as a folder for a robot: ONNX, contract, wheel"),
+    "certs": Command(_certs, "make certificates, with which a run is encrypted and roles hold"),
     "release": Command(_release, "put a policy into the box, with its measures"),
 }
 

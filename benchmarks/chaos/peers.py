@@ -41,7 +41,13 @@ def garbage(run: str, endpoint: str) -> None:
         keys.status("learner", "0"),
         keys.status("actor", "0"),
     ]
-    asked = [keys.rollout(), keys.ctl("learner", "0"), keys.ctl("actor", "0"), keys.policy()]
+    asked = [
+        keys.rollout("0"),
+        keys.report("0"),
+        keys.ctl("learner", "0"),
+        keys.ctl("actor", "0"),
+        keys.policy(),
+    ]
     while True:
         payload = dice.randbytes(dice.choice((0, 1, 100, 5_000, LARGEST)))
         session.put(dice.choice(told), payload)

@@ -47,7 +47,7 @@ LONGEST_TEXT: Final = 512
 ID_PATTERN: Final = rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{LONGEST_ID - 1}}}"
 HASH_PATTERN: Final = r"[A-Za-z0-9]{0,64}"
 
-LISTED_REFUSALS: Final = 256  # newest refusals, and dropped rollouts, in one report
+LISTED_REFUSALS: Final = 256  # newest refusals, dropped rollouts, and those in flight, in one report
 
 
 def budget_of(name: str) -> Budget:

@@ -20,7 +20,7 @@ import zlib
 from collections.abc import Mapping
 from enum import Enum
 from types import MappingProxyType
-from typing import Any, Final, TypeVar, overload
+from typing import Any, Final, TypeVar
 
 import msgpack
 import numpy as np
@@ -44,7 +44,6 @@ class EncodeError(ValueError):
 
 
 _M = TypeVar("_M", bound=Message)
-_N = TypeVar("_N", bound=Message)
 
 
 def encode(message: Message) -> bytes:
@@ -60,40 +59,20 @@ def encode(message: Message) -> bytes:
 
 def decode(payload: bytes, expected: type[_M], *, limit_bytes: int = DEFAULT_LIMIT_BYTES) -> _M:
     """Return the checked message in ``payload``. For any bytes it raises DecodeError or nothing."""
-    return typing.cast(_M, _decode(payload, (expected,), limit_bytes))
-
-
-@overload
-def decode_one_of(payload: bytes, expected: tuple[type[_M]], *, limit_bytes: int = ...) -> _M: ...
-@overload
-def decode_one_of(
-    payload: bytes, expected: tuple[type[_M], type[_N]], *, limit_bytes: int = ...
-) -> _M | _N: ...
-def decode_one_of(
-    payload: bytes, expected: tuple[type[Message], ...], *, limit_bytes: int = DEFAULT_LIMIT_BYTES
-) -> Any:
-    """Return the message in ``payload``, of one of these types. Apart from that it is `decode`."""
-    return _decode(payload, expected, limit_bytes)
-
-
-def _decode(payload: bytes, expected: tuple[type[Message], ...], limit_bytes: int) -> Any:
-    names = " or ".join(kind.__name__ for kind in expected)
-    most = max(budget_of(kind.__name__).bytes for kind in expected)
-    if len(payload) > (allowed := min(limit_bytes, most)):
-        raise DecodeError(f"{names}: {len(payload)} bytes; allowed: up to {allowed}")
-    content = _unpack(_body(payload, names), names, max(budget_of(kind.__name__).items for kind in expected))
+    name, budget = expected.__name__, budget_of(expected.__name__)
+    if len(payload) > (allowed := min(limit_bytes, budget.bytes)):
+        raise DecodeError(f"{name}: {len(payload)} bytes; allowed: up to {allowed}")
+    content = _unpack(_body(payload, name), name, budget.items)
     if not (isinstance(content, list) and len(content) == 3 and isinstance(content[2], dict)):
-        raise DecodeError(f"{names}: the body is not [type, version, fields]")
+        raise DecodeError(f"{name}: the body is not [type, version, fields]")
     got_type, got_version, fields = content
-    kind = next((kind for kind in expected if kind.__name__ == got_type), None)
-    if kind is None:
-        raise DecodeError(f"got a message of type {_short(got_type)}; allowed here: {names}")
-    if type(got_version) is not int or got_version != kind.VERSION:
+    if got_type != name:
+        raise DecodeError(f"got a message of type {_short(got_type)}; allowed here: {name}")
+    if type(got_version) is not int or got_version != expected.VERSION:
         raise DecodeError(
-            f"{got_type}: version {_short(got_version)}; allowed: {kind.VERSION}: "
-            "run the same release everywhere"
+            f"{name}: version {_short(got_version)}; allowed: {expected.VERSION}: run the same release everywhere"
         )
-    return _read_fields(fields, kind, kind.__name__, Dims())
+    return typing.cast(_M, _read_fields(fields, expected, name, Dims()))
 
 
 def salvage(payload: bytes, expected: type[_M], names: tuple[str, ...]) -> dict[str, Any]:

@@ -1,13 +1,19 @@
 """All keys of the services, and the matching of key expressions with keys.
 
-topspin/v1/<run>/policy                          latest policy: put as a hint; late joiners request it
-topspin/v1/<run>/stage                           stage changes: put as a hint; an actor then requests the policy,
+topspin/v2/<run>/policy                          latest policy: put as a hint; late joiners request it
+topspin/v2/<run>/stage                           stage changes: put as a hint; an actor then requests the policy,
                                                  which contains its stage. A request returns all changes
-topspin/v1/<run>/rollout                         rollouts: requests to the learner; the reply is the verdict
-topspin/v1/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
-topspin/v1/<run>/ctl/<role>/<id>                 commands to one service; actors' reports to the learner
-topspin/v1/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
-topspin/v1/<run>/status/<role>/<id>              heartbeats with cumulative counters
+topspin/v2/<run>/rollout/<actor>                 rollouts of one actor: requests to the learner; the reply is the
+                                                 verdict
+topspin/v2/<run>/report/<actor>                  reports of one actor: requests to the learner; the reply is a
+                                                 verdict with new credits
+topspin/v2/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
+topspin/v2/<run>/ctl/<role>/<id>                 commands to one service
+topspin/v2/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
+topspin/v2/<run>/status/<role>/<id>              heartbeats with cumulative counters
+
+A key names its sender wherever a certificate can stand for it (`common.comms.roles`). Receivers refuse a message that
+names another one.
 """
 
 import re
@@ -17,7 +23,7 @@ from typing import Final
 from common.comms.budgets import ID_PATTERN, one_line
 from common.errors import ReportedError
 
-PREFIX: Final = "topspin/v1"
+PREFIX: Final = "topspin/v2"
 ROLES: Final = ("generator", "actor", "learner", "evaluator")
 
 # A part contains no wildcard (* $ # ?), no separator (/) and not Zenoh's verbatim mark (@).
@@ -55,17 +61,37 @@ class Keys:
         """Return the key of stage changes."""
         return f"{PREFIX}/{self.run}/stage"
 
-    def rollout(self) -> str:
-        """Return the key for rollouts."""
-        return f"{PREFIX}/{self.run}/rollout"
+    def rollout(self, actor: str) -> str:
+        """Return the key for the rollouts of one actor."""
+        return f"{PREFIX}/{self.run}/rollout/{_part('id', actor)}"
+
+    def every_rollout(self) -> str:
+        """Return the expression that matches the rollouts of all actors."""
+        return f"{PREFIX}/{self.run}/rollout/*"
+
+    def report(self, actor: str) -> str:
+        """Return the key for the reports of one actor."""
+        return f"{PREFIX}/{self.run}/report/{_part('id', actor)}"
+
+    def every_report(self) -> str:
+        """Return the expression that matches the reports of all actors."""
+        return f"{PREFIX}/{self.run}/report/*"
 
     def rally(self, shard: int) -> str:
         """Return the key of the valid rallies of one shard (0, 1, ...)."""
         return f"{PREFIX}/{self.run}/rally/{_number('shard', shard)}"
 
+    def every_rally(self) -> str:
+        """Return the expression that matches the valid rallies of all shards."""
+        return f"{PREFIX}/{self.run}/rally/*"
+
     def ctl(self, role: str, id_: str) -> str:
-        """Return the key of requests to one service."""
+        """Return the key of commands to one service."""
         return f"{PREFIX}/{self.run}/ctl/{_role(role)}/{_part('id', id_)}"
+
+    def every_ctl(self) -> str:
+        """Return the expression that matches the commands to all services."""
+        return f"{PREFIX}/{self.run}/ctl/*/*"
 
     def alive(self, role: str, id_: str, incarnation: int) -> str:
         """Return the key of the liveliness token of one incarnation of a service."""
@@ -80,6 +106,14 @@ class Keys:
         """Return the expression that matches the liveliness tokens of one role."""
         return f"{PREFIX}/{self.run}/alive/{_role(role)}/**"
 
+    def every_life_of(self, role: str, id_: str) -> str:
+        """Return the expression that matches the liveliness tokens of one service."""
+        return f"{PREFIX}/{self.run}/alive/{_role(role)}/{_part('id', id_)}/*"
+
+    def everything(self) -> str:
+        """Return the expression that matches all keys of the run."""
+        return f"{PREFIX}/{self.run}/**"
+
     def status(self, role: str, id_: str) -> str:
         """Return the key of one service's heartbeats."""
         return f"{PREFIX}/{self.run}/status/{_role(role)}/{_part('id', id_)}"
@@ -87,6 +121,10 @@ class Keys:
     def every_status(self) -> str:
         """Return the expression that matches all heartbeats of the run."""
         return f"{PREFIX}/{self.run}/status/**"
+
+    def sender(self, key: str) -> str:
+        """Return the id in the last part of a key: who sends on it."""
+        return _part("id", key.rpartition("/")[2])
 
     def member(self, alive_key: str) -> Member:
         """Return the owner of a liveliness key of this run."""

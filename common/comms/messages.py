@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from common.comms.budgets import HASH_PATTERN, ID_PATTERN
+from common.comms.budgets import HASH_PATTERN, ID_PATTERN, LISTED_REFUSALS
 from common.comms.wire import Wire
 
 F32 = npt.NDArray[np.float32]
@@ -27,6 +27,7 @@ Count = Annotated[int, Wire("1", low=0, high=2**62)]
 # Of an actor's incarnation. No actor reaches the limit (4 a second: 70 million years), and a heartbeat's float is
 # exact.
 Sequence = Annotated[int, Wire("1", low=0, high=2**53)]
+Sequences = Annotated[tuple[int, ...], Wire("1", low=0, high=2**53)]
 Stage = Annotated[int, Wire("1", low=1, high=3)]
 Seconds = Annotated[float, Wire("s", low=0)]
 Id = Annotated[str, Wire(text=ID_PATTERN)]  # what can stand in a key
@@ -195,7 +196,7 @@ class VerdictKind(StrEnum):
     TOO_OLD = "too_old"
     DUPLICATE = "duplicate"  # received before; ``first`` holds the first verdict
     BUSY = "busy"
-    UNREADABLE = "unreadable"  # damaged so much that its sender is unknown
+    UNREADABLE = "unreadable"  # its sender is unknown: it is damaged, or names another actor than its key
     CREDITS = "credits"  # the answer to an ActorReport
 
 
@@ -229,7 +230,7 @@ class Verdict:
     # Flow control by an absolute limit: a lost or repeated answer changes nothing.
     credit_limit: Count  # the actor may publish sequence numbers less than this ...
     credit_version: Count  # ... if this version or a later one played them
-    report_after_s: Annotated[float, Wire("s", low=0, high=3600)] = (
+    report_after_s: Annotated[float, Wire("s", low=0, high=64)] = (
         0.25  # pause of an idle actor between reports
     )
 
@@ -260,12 +261,24 @@ class ActorReport:
     incarnation: Count
     version: Count  # of the policy that the actor holds
     published: Sequence  # sequence numbers used so far
-    in_flight: tuple[int, ...]
-    dropped: tuple[int, ...]  # given up
+    in_flight: Sequences
+    dropped: Sequences  # given up
     generation: Count  # of the learner that answered last; 0: none so far
     refused: tuple[Refusal, ...]  # by learners of other generations
     leaving: bool  # the actor sends nothing more
     training_hash: Hash = ""  # of the actor's task, network and experience; "" fits no learner
+
+    def fault(self) -> str:
+        """Return the inconsistency, or "" if there is none."""
+        counts = (("in_flight", self.in_flight), ("dropped", self.dropped), ("refused", self.refused))
+        return next(
+            (
+                f"{len(n)} {name}; allowed: up to {LISTED_REFUSALS}"
+                for name, n in counts
+                if len(n) > LISTED_REFUSALS
+            ),
+            "",
+        )
 
 
 @dataclass(frozen=True, slots=True)

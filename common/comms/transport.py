@@ -154,6 +154,12 @@ class Mailbox(Generic[_Item]):
             self._bytes = 0
             return items
 
+    def remind(self) -> None:
+        """Ring for the items that are waiting still."""
+        with self._bell.lock:
+            if self._items:
+                self._bell.ring()
+
     def _pop(self) -> _Item:
         item, size = self._items.popleft()
         self._bytes -= size
@@ -248,11 +254,15 @@ class Server:
         return None if raw is None else self._read(raw)
 
     def waiting(self, most: int) -> Iterator[Request]:
-        """Yield the requests that wait, oldest first, ``most`` at most: those that arrive meanwhile delay nobody."""
+        """Yield the requests that wait, oldest first, ``most`` at most: those that arrive meanwhile delay nobody.
+
+        Those that are left end the transport's next wait.
+        """
         for _ in range(most):
             if (request := self.poll()) is None:
                 return
             yield request
+        self._inbox.remind()
 
     def close(self) -> None:
         """Stop serving. Requests that were not taken end with NO_SERVER, also those that arrive during this call."""

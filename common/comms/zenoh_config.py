@@ -10,11 +10,15 @@ In measurements the default of each of these settings lost messages or blocked a
   that asked for 100 policies and then hung stopped the hub for 15 s, and other clients for good. Now it costs nobody
   more than 50 ms. An answer that is dropped is asked for again.
 * The lease is short, so that a hung process is detected. The receive buffer doubles the throughput at 1 MB.
+* With TLS a link ends when a certificate of it expires, and the hub applies the access rules (`common.comms.roles`).
 """
 
+from dataclasses import dataclass
 from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from common.comms.certificates import Files
 
 EVERY_ADDRESS: Final = ("0.0.0.0", "[::]", "[::0]")  # hosts of an endpoint that listens on all of a machine's
 
@@ -58,17 +62,23 @@ class LinkConfig(BaseModel):
     max_message_mib: int = Field(
         64, ge=1, le=1024, description="largest message", json_schema_extra={"unit": "MiB"}
     )
-    tls_ca: str = Field("", description="file with the authority's certificate; if given, TLS is mutual")
-    tls_certificate: str = Field("", description="file with this service's certificate")
-    tls_key: str = Field("", description="file with this service's private key")
+    tls: str = Field(
+        "",
+        description="folder of certificates (topspin certs): links are encrypted, and each service may only say what "
+        "its role says; empty: open",
+    )
 
     @model_validator(mode="after")
     def _tls_is_whole(self) -> Self:
-        files = (self.tls_ca, self.tls_certificate, self.tls_key)
-        if self.endpoint.startswith("tls/") != any(files) or any(files) != all(files):
+        if self.endpoint and self.endpoint.startswith("tls/") != bool(self.tls):
             raise ValueError(
-                f"endpoint {self.endpoint} needs {'all' if self.endpoint.startswith('tls/') else 'none'} of tls_ca, "
-                f"tls_certificate, tls_key; got {files}; allowed: all three with tls/..., none without"
+                f"endpoint {self.endpoint} with {f'--tls {self.tls}' if self.tls else 'no folder of certificates'}; "
+                "allowed: an endpoint tls/... with --tls DIR, any other without"
+            )
+        if self.tls and self.peers:
+            raise ValueError(
+                f"peers {','.join(self.peers)} with --tls {self.tls}; allowed: one hub, since its rules would drop "
+                "what another router passes on"
             )
         return self
 
@@ -81,7 +91,18 @@ class ZenohConfig(LinkConfig):
     )
 
 
-def session_settings(config: ZenohConfig, attempt_s: float) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Security:
+    """What a session with TLS needs besides its configuration."""
+
+    files: Files
+    admitted: tuple[str, ...] = ()  # at a hub: names of the certificates that it knows
+    access_control: dict[str, Any] | None = None  # at a hub: what their owners may do
+
+
+def session_settings(
+    config: ZenohConfig, attempt_s: float, security: Security | None = None
+) -> dict[str, Any]:
     """Return Zenoh's settings by path. One attempt to connect takes at most ``attempt_s`` [s]."""
     settings: dict[str, Any] = {
         "mode": "router" if config.mode == "hub" else "client",
@@ -112,14 +133,19 @@ def session_settings(config: ZenohConfig, attempt_s: float) -> dict[str, Any]:
                 "overwrite": {"congestion_control": "drop"},
             }
         ]
-    if config.tls_ca:
+    if security is not None:
+        certificate, key = str(security.files.certificate), str(security.files.key)
         settings["transport/link/protocols"] = ["tls"]
         settings["transport/link/tls"] = {
-            "root_ca_certificate": config.tls_ca,
+            "root_ca_certificate": str(security.files.ca),
             "enable_mtls": True,
-            "listen_certificate": config.tls_certificate,
-            "listen_private_key": config.tls_key,
-            "connect_certificate": config.tls_certificate,
-            "connect_private_key": config.tls_key,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+            "listen_certificate": certificate,
+            "listen_private_key": key,
+            "connect_certificate": certificate,
+            "connect_private_key": key,
         }
+        if security.access_control is not None:
+            settings["access_control"] = security.access_control
     return settings

@@ -14,6 +14,7 @@ The code works around these properties of Zenoh, all of them measured:
 * An answer may wait 50 ms for a client that hangs. So large ones are sent by a thread of their own, at most
   `_ANSWERS_WAITING` at a time; the hub's settings bound the wait.
 * A link may stand although nothing comes back. So a session whose requests time out in a row is opened again.
+* A refused certificate looks like a hub that is not there. So a client then opens a TLS link of its own to learn why.
 """
 
 import json
@@ -31,6 +32,9 @@ from typing import Any, Final
 import zenoh
 from zenoh.handlers import Callback
 
+from common.comms.budgets import LONGEST_ID, one_line
+from common.comms.certificates import checked, names_in, refusal, speaks_tls, valid_until
+from common.comms.roles import access_control
 from common.comms.transport import (
     MAX_ALIVE_EVENTS,
     AliveEvent,
@@ -50,7 +54,7 @@ from common.comms.transport import (
     check_size,
     is_stuck,
 )
-from common.comms.zenoh_config import ZenohConfig, session_settings
+from common.comms.zenoh_config import Security, ZenohConfig, session_settings
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +69,7 @@ _MIB: Final = 1024 * 1024
 _LARGE_ANSWER: Final = 64 * 1024  # [bytes] from here on the thread for answers sends it
 _ANSWERS_WAITING: Final = 32  # large ones; more are refused, and their clients ask again
 _CLOSE_OLD_S: Final = 2.0
+_STRANGERS_LOGGED: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,15 +90,25 @@ _SERVICES: Final = {
 }
 
 
-def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "ZenohTransport":
+def open_zenoh(
+    config: ZenohConfig, stop: threading.Event | None = None, *, name: str = "", run: str = ""
+) -> "ZenohTransport":
     """Return an open transport. A client waits for its hub, at most ``connect_timeout_s`` or until ``stop``.
 
+    Args:
+        config: Where the hub is.
+        stop: Ends the wait.
+        name: With TLS, the name of the certificate to use, such as ``actor-0``.
+        run: With TLS, the run whose access rules a hub applies.
+
     Raises:
-        TransportError: The hub's port is taken, or no hub answered in time.
+        TransportError: The hub's port is taken, no hub answered in time, or one side refuses the other's certificate.
+        CertificateError: The own certificate can't be used.
     """
+    security = _security(config, name, run) if config.tls else None
     if config.mode == "hub":
         try:
-            return ZenohTransport(zenoh.open(_zenoh_config(config, _OPEN_ATTEMPT_S)), config)
+            return _opened(config, security, _OPEN_ATTEMPT_S)
         except zenoh.ZError as error:
             raise TransportError(
                 f"can't listen at {config.endpoint}: {_reason(error)}; stop the learner that listens there, "
@@ -110,19 +125,45 @@ def open_zenoh(config: ZenohConfig, stop: threading.Event | None = None) -> "Zen
             raise TransportError(
                 f"no hub answered at {config.endpoint} in {now - started:.0f} s: "
                 "start the learner (python -m services.learner) or correct the endpoint"
+                + (", or start the learner with --tls too" if security else "")
             )
         if now >= next_log:
             log.info("waiting for the hub endpoint=%s waited_s=%.0f", config.endpoint, now - started)
             next_log = now + _WAITING_LOG_S
         try:
-            return ZenohTransport(zenoh.open(_zenoh_config(config, min(left, _OPEN_ATTEMPT_S))), config)
+            return _opened(config, security, min(left, _OPEN_ATTEMPT_S))
         except zenoh.ZError as error:
             log.debug("no hub yet endpoint=%s reason=%s", config.endpoint, _reason(error))
+        if why := _refusal(config, security):
+            raise TransportError(f"no link to the hub at {config.endpoint}: {why}")
 
 
-def _zenoh_config(config: ZenohConfig, attempt_s: float) -> zenoh.Config:
+def _security(config: ZenohConfig, name: str, run: str) -> Security:
+    files = checked(config.tls, name)
+    log.info("link secured certificate=%s valid_until=%s", files.certificate, valid_until(files.certificate))
+    if config.mode == "client":
+        return Security(files)
+    admitted = names_in(config.tls)
+    return Security(files, admitted, access_control(admitted, run))
+
+
+def _refusal(config: ZenohConfig, security: Security | None) -> str:
+    """Return why the hub that listens at the endpoint is no hub for this client, or ""."""
+    if security is not None:
+        return one_line(refusal(config.endpoint, security.files))
+    if config.endpoint.startswith("tcp/") and speaks_tls(config.endpoint):
+        return "it wants TLS; give an endpoint tls/... and --tls DIR"
+    return ""
+
+
+def _opened(config: ZenohConfig, security: Security | None, attempt_s: float) -> "ZenohTransport":
+    session = zenoh.open(_zenoh_config(config, security, attempt_s))
+    return ZenohTransport(session, config, security)
+
+
+def _zenoh_config(config: ZenohConfig, security: Security | None, attempt_s: float) -> zenoh.Config:
     settings = zenoh.Config()
-    for path, value in session_settings(config, attempt_s).items():
+    for path, value in session_settings(config, attempt_s, security).items():
         try:
             settings.insert_json5(path, json.dumps(value))
         except zenoh.ZError as error:
@@ -152,9 +193,10 @@ class _ZenohToken:
 class ZenohTransport:
     """One service's session. `Transport` documents its methods."""
 
-    def __init__(self, session: zenoh.Session, config: ZenohConfig) -> None:
+    def __init__(self, session: zenoh.Session, config: ZenohConfig, security: Security | None = None) -> None:
         self._session = session
         self._config = config
+        self._security = security
         self._process = os.getpid()
         self._is_closed = False
         self._bell = Bell()
@@ -167,6 +209,7 @@ class ZenohTransport:
         self._unanswered = Unanswered()
         self._links: dict[str, bool] = {}
         self._times_up = 0
+        self._strangers: set[str] = set()
         self._link_events: Mailbox[tuple[str, bool]] = Mailbox(self._bell, MAX_ALIVE_EVENTS, keep="newest")
         self._declare("watch the links", self._watch_links)
 
@@ -323,7 +366,7 @@ class ZenohTransport:
             self._config.endpoint,
         )
         try:
-            fresh = zenoh.open(_zenoh_config(self._config, _OPEN_ATTEMPT_S))
+            fresh = zenoh.open(_zenoh_config(self._config, self._security, _OPEN_ATTEMPT_S))
         except zenoh.ZError as error:
             log.warning("hub does not answer endpoint=%s reason=%s", self._config.endpoint, _reason(error))
             return
@@ -394,6 +437,19 @@ class ZenohTransport:
         for peer, up in self._link_events.take_all():
             self._times_up += up
             self._links[peer] = up
+            if up and self._security is not None and self._security.access_control is not None:
+                self._name_strangers(self._security.admitted)
+
+    def _name_strangers(self, admitted: tuple[str, ...]) -> None:
+        """Log, once for each name, which linked certificates the hub does not know."""
+        for link in self._session.info.links():
+            name = one_line(str(link.auth_identifier or ""), LONGEST_ID)
+            if name in admitted or name in self._strangers or len(self._strangers) >= _STRANGERS_LOGGED:
+                continue
+            self._strangers.add(name)
+            log.warning(
+                "certificate %r is not in the folder %s: its owner may do nothing", name, self._config.tls
+            )
 
 
 def _read_sample(sample: zenoh.Sample) -> Sample:
@@ -411,6 +467,7 @@ def _answer(query: zenoh.Query, payload: bytes | None) -> None:
         if payload is not None:
             query.reply(query.key_expr, payload)
     except zenoh.ZError as error:
-        log.debug("reply not sent, the client has left key=%s reason=%s", query.key_expr, _reason(error))
+        key = one_line(str(query.key_expr))  # a peer's text
+        log.debug("reply not sent, the client has left key=%s reason=%s", key, _reason(error))
     finally:
         query.drop()  # type: ignore[no-untyped-call]  # ends the query; without it the client waits for its time-out

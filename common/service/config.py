@@ -36,7 +36,7 @@ ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
 TABLES: Final = (
     *("task", "experience", "network"),
     *("generator", "actor", "learner", "evaluator", "router"),
-    *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "export", "bench"),
+    *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "export", "certs", "bench"),
 )
 """Tables of a settings file. A nested model of one of these names is read from that table, whatever the program."""
 SHARED: Final = (
@@ -47,9 +47,7 @@ SHARED: Final = (
         "connect_timeout_s",
         "lease_s",
         "max_message_mib",
-        "tls_ca",
-        "tls_certificate",
-        "tls_key",
+        "tls",
     ),
     *("metrics_host", "log_level", "status_interval_s"),
 )

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from threading import Event
 
+from common.comms.roles import name_of
 from common.comms.transport import Transport
 from common.comms.zenoh_transport import open_zenoh
 from common.service.log import set_up_logging
@@ -27,5 +28,6 @@ def connected(role: str, config: ServiceConfig, stop: Event) -> Iterator[tuple[T
     with closing(Metrics(role, config.id, config.run)) as metrics:
         port = metrics.serve(config.metrics_port, config.metrics_host)
         log.info("serving metrics url=http://%s:%d/metrics", config.metrics_host, port)
-        with closing(open_zenoh(config, stop)) as transport:
+        name = name_of(role, config.id)
+        with closing(open_zenoh(config, stop, name=name, run=config.run)) as transport:
             yield transport, metrics

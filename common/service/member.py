@@ -7,14 +7,14 @@ disappears when the process ends.
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 from common.comms.budgets import one_line
-from common.comms.codec import DecodeError, decode_one_of, encode
+from common.comms.codec import DecodeError, decode, encode
 from common.comms.keys import Keys
-from common.comms.messages import ActorReport, Command, Control, ControlReply, Status, Verdict
+from common.comms.messages import Command, Control, ControlReply, Status
 from common.comms.transport import AliveToken, Flow, Transport
 from common.service.metrics import Metrics
 from common.service.settings import ServiceConfig
@@ -23,7 +23,8 @@ log = logging.getLogger(__name__)
 
 LEARNER_ID: Final = "0"  # a run has one learner
 REFUSALS_LOGGED: Final = 20  # lines a minute for each kind of refused message; all are counted
-CONTROL_MAILBOX: Final = 256  # requests that wait; more than all actors of a run send at once
+CONTROL_MAILBOX: Final = 16  # commands that wait
+ON_AN_OPEN_HUB: Final = "commands need TLS (--tls): on an open hub anybody could send them"
 
 
 class Drops(Protocol):
@@ -90,7 +91,7 @@ class Member:
         self._token: AliveToken | None = None
         self._refusals: dict[str, RefusalLog] = {}
         self._link_lost: float | None = None  # [s]
-        self._endpoint = config.endpoint
+        self._endpoint, self._takes_commands = config.endpoint, bool(config.tls)
         metrics.inc("topspin_messages_refused_total", 0.0, kind="control")
 
     def join(self) -> None:
@@ -103,26 +104,22 @@ class Member:
         """Count what these mailboxes drop under ``name``."""
         self._mailboxes[name] = mailboxes
 
-    def answer_control(self, report: Callable[[ActorReport], Verdict] | None = None) -> None:
-        """Answer the control requests that wait.
-
-        Args:
-            report: Answers an actor's report; None where actors do not report to this service.
-        """
+    def answer_control(self) -> None:
+        """Answer the commands that wait. Without TLS nobody knows who sent them, and they are refused."""
         self._metrics.health.turn()  # every main loop comes by here, also within an update or a match
-        allowed = (Control,) if report is None else (ActorReport, Control)
         for request in self._control.waiting(CONTROL_MAILBOX):
             try:
-                message = decode_one_of(request.payload, allowed)
+                message = decode(request.payload, Control)
             except DecodeError as error:
                 self.refuse("control", error)
                 request.refuse()
                 continue
-            if isinstance(message, ActorReport) and report is not None:
-                request.reply(encode(report(message)))
+            if not self._takes_commands:
+                self.refuse("control", ON_AN_OPEN_HUB)
+                request.reply(encode(ControlReply(False, self.state, ON_AN_OPEN_HUB)))
                 continue
-            if isinstance(message, Control):
-                self.is_draining |= message.command is Command.DRAIN
+            self.is_draining |= message.command is Command.DRAIN
+            log.info("command received command=%s", message.command.value)
             request.reply(encode(ControlReply(True, self.state, "")))
 
     def refuse(self, kind: str, reason: object) -> None:

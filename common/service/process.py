@@ -20,6 +20,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
+from common.comms.certificates import CertificateError
 from common.comms.keys import KeyPartError
 from common.errors import ReportedError
 from common.service.config import ConfigError, HelpRequest
@@ -35,6 +36,7 @@ INTERRUPTED: Final = 130
 STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ConfigError: BAD_CONFIG,
     KeyPartError: BAD_CONFIG,
+    CertificateError: BAD_CONFIG,
     ReportedError: FAILED,
 }
 

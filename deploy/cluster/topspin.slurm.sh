@@ -21,14 +21,9 @@ mkdir -p "$folder/logs"
 cat >"$settings" <<END
 run = "$run"
 endpoint = "tcp/$(hostname):7447"
-metrics_host = "0.0.0.0"
-[learner]
-actors = $SLURM_NTASKS
-[generator]
 actors = $SLURM_NTASKS
 generators = 1
-[actor]
-actors = $SLURM_NTASKS
+metrics_host = "0.0.0.0"
 END
 
 workers=()

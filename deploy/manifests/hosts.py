@@ -103,14 +103,9 @@ mkdir -p "$folder/logs"
 cat >"$settings" <<END
 run = "$run"
 endpoint = "tcp/$(hostname):{LINK_PORT}"
-metrics_host = "0.0.0.0"
-[learner]
-actors = $SLURM_NTASKS
-[generator]
 actors = $SLURM_NTASKS
 generators = {SITE.generators}
-[actor]
-actors = $SLURM_NTASKS
+metrics_host = "0.0.0.0"
 END
 
 workers=()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from common.service.endpoint import FIRST_PORT
-from deploy.topology import ROLES, Role
+from deploy.topology import Role
 
 IMAGE: Final = "topspin:0.2.0"
 LINK_PORT: Final = 7447
@@ -41,16 +41,11 @@ def settings(endpoint: str, tls: bool = False) -> str:
     return (
         "# The settings of every service of the run. `topspin train --help-all` lists all of them.\n"
         f'run = "{SITE.run}"\n'
+        f"actors = {SITE.actors}  # at most: they share 256 environments, and a dataset is as many rollouts\n"
+        f"generators = {SITE.generators}\n"
         f'endpoint = "{endpoint}"\n'
         f"{folder}"
         'metrics_host = "0.0.0.0"\n'
-        + "".join(
-            f"\n[{role.name}]\n"
-            f"actors = {SITE.actors}  # of the run, at most: they share 256 environments\n"
-            + (f"generators = {SITE.generators}\n" if role.name == "generator" else "")
-            for role in ROLES
-            if role.name != "evaluator"
-        )
     )
 
 

@@ -138,7 +138,7 @@ def unanswered(outbox: Outbox, sequence: int, now: float) -> Outbox:
 
 def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Outbox:
     """Return the outbox after a verdict; if its rollout is no longer in flight, only the credits change."""
-    outbox = credited(outbox, verdict)
+    outbox = credited(outbox, verdict, (sequence + 1, 0))  # it was played with a credit for this number
     if sequence not in (flight.sequence for flight in outbox.flights):
         return outbox
     # a duplicate's recorded verdict is in ``first``: the answer to an earlier try was lost
@@ -151,10 +151,18 @@ def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Out
     return replace(outbox, flights=rest, refused=(*outbox.refused, refusal))
 
 
-def credited(outbox: Outbox, verdict: Verdict) -> Outbox:
-    """Return the outbox with the credits that came with a verdict of the followed learner."""
+def credited(outbox: Outbox, verdict: Verdict, known: tuple[int, int] = (0, 0)) -> Outbox:
+    """Return the outbox with the credits that came with a verdict of the followed learner.
+
+    Args:
+        outbox: The outbox.
+        verdict: The learner's answer.
+        known: Limit and version of the credits when the request was sent. A learner takes none back, so an answer with
+            less shows that they were forged, and counts as it is.
+    """
     limit, version = verdict.credit_limit, verdict.credit_version
-    if verdict.generation == outbox.generation:
+    is_as_known = limit >= known[0] and version >= known[1]
+    if verdict.generation == outbox.generation and is_as_known:
         limit = max(outbox.credit_limit, limit)
         version = max(outbox.credit_version, version)
     return replace(outbox, generation=verdict.generation, credit_limit=limit, credit_version=version)

@@ -17,7 +17,7 @@ from common.comms.messages import (
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.policy.contract import PolicyError
 from common.service.history import History
-from common.service.member import LEARNER_ID, Member
+from common.service.member import Member
 from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
@@ -76,6 +76,7 @@ class ActorService:
         self._asked: PendingReply | None = None
         self._next_ask = self._next_report = 0.0
         self._report_after_s = REPORT_INTERVAL_S
+        self._known_credits = (0, 0, 0)  # generation, limit and version of the credits at the last report
         self._reported = (0, 0)  # generation and version of the policy in the last report
         self._following = Following()
         self._is_doubted = False  # whether the policy is not the learner's, though it has its generation
@@ -176,7 +177,8 @@ class ActorService:
         if not self._transport.connected:
             return f"the link to the hub at {self._config.endpoint}"
         if not self._following.standing:
-            return f"a learner: run {self._config.run!r} has none at the hub"
+            unknown = ", or the hub does not know this certificate" if self._config.tls else ""
+            return f"a learner: run {self._config.run!r} has none at the hub{unknown}"
         if snapshot is None:
             return self._misfit or f"a policy from the learner on {self._keys.policy()}"
         self._ready = now if self._ready is None else self._ready
@@ -335,7 +337,10 @@ class ActorService:
                 self._metrics.inc("topspin_rollouts_retried_total", 1.0)
             self._history.note("sent", number=flight.sequence, tries=flight.tries + 1)
             self._pending[flight.sequence] = self._transport.request(
-                self._keys.rollout(), flight.payload, self._config.outbox.request_timeout_s, Flow.ROLLOUT
+                self._keys.rollout(self._config.id),
+                flight.payload,
+                self._config.outbox.request_timeout_s,
+                Flow.ROLLOUT,
             )
             self._metrics.inc("topspin_bytes_sent_total", len(flight.payload))
             self._outbox = box.sent(self._outbox, flight.sequence)
@@ -357,7 +362,9 @@ class ActorService:
             self._report = None
             verdict = self._verdict(outcome)
             if verdict is not None:
-                self._outbox = box.credited(self._outbox, verdict)
+                generation, limit, version = self._known_credits
+                known = (limit, version) if generation == verdict.generation else (0, 0)
+                self._outbox = box.credited(self._outbox, verdict, known)
                 self._heed(verdict)
 
     def _heed(self, verdict: Verdict) -> None:
@@ -419,8 +426,10 @@ class ActorService:
             leaving=leaving,
         )
         self._reported = (snapshot.generation, snapshot.version) if snapshot else (0, 0)
+        outbox = self._outbox
+        self._known_credits = (outbox.generation, outbox.credit_limit, outbox.credit_version)
         return self._transport.request(
-            self._keys.ctl("learner", LEARNER_ID), encode(report), timeout_s, Flow.CONTROL
+            self._keys.report(self._config.id), encode(report), timeout_s, Flow.CONTROL
         )
 
     # ---- numbers

@@ -63,6 +63,7 @@ class Case:
     queue_limit: int
     version_at_use: int  # the learner's version when an update will use this rollout
     max_lag: int
+    credit_end: int  # numbers from there on were never granted, by a whole window
 
 
 def differs(what: str, got: object, wanted: object) -> str:
@@ -80,6 +81,11 @@ def _too_old(case: Case) -> str:
     version, at_use = case.header.version, case.version_at_use
     is_too_old = at_use - version > case.max_lag
     return f"version {version} would be used at {at_use}; allowed lag: {case.max_lag}" if is_too_old else ""
+
+
+def _beyond_credits(case: Case) -> str:
+    number, end = case.header.sequence, case.credit_end
+    return f"number {number} without a credit; allowed: less than {end}" if number >= end else ""
 
 
 # Each rule returns why it applies, or "".
@@ -100,6 +106,7 @@ RULES: Final[tuple[tuple[VerdictKind, Callable[[Case], str]], ...]] = (
         lambda case: differs("stage number", case.header.stage_number, case.learner.stage_number),
     ),
     (VerdictKind.TOO_OLD, _too_old),
+    (VerdictKind.INVALID, _beyond_credits),
     (
         VerdictKind.BUSY,
         lambda case: f"{case.queued} wait" if case.queued >= case.queue_limit else "",

@@ -31,6 +31,7 @@ _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
 
 IDLE_REPORTS_HZ: Final = 16.0  # reports of all waiting actors together: 2 % of a core (benchmarks.idle)
 SOONEST_REPORT_S: Final = 0.25  # pause between reports of a small fleet
+LATEST_REPORT_S: Final = 64.0  # of one of more than 1,000 actors
 FREE_REFUSALS: Final = 2  # in a row: a stage change or a restart costs an actor as many as it has in flight
 LONGEST_PAUSE_S: Final = 60.0  # without credits, after many refusals in a row
 FOLD_AFTER_S: Final = 600.0  # a life that a newer one of the same actor has replaced
@@ -38,7 +39,9 @@ FOLD_LAST_AFTER_S: Final = 86_400.0  # the last life of an actor: by then it has
 MOST_ACCOUNTS: Final = 16_384  # a new one beyond closes a dead one early, or is refused
 LIVES_KEPT: Final = 4096  # closed lives whose late messages are told from those of new ones
 
-LONGEST_JUMP: Final = 65_536  # of the numbers of a known life: far more than any window or outage takes
+# How far the numbers of a known life may go on in one message
+BEYOND_CREDITS: Final = 64  # more than any window: from what this learner granted
+LONGEST_JUMP: Final = 65_536  # more than any outage takes: from what an earlier learner may have granted
 
 EARLIER: Final = ("", 0)  # the account of all closed lives
 
@@ -192,7 +195,7 @@ class Intake:
     @property
     def report_after_s(self) -> float:
         """Pause between two reports of a waiting actor [s]: all together send `IDLE_REPORTS_HZ`."""
-        return max(SOONEST_REPORT_S, len(self._living) / IDLE_REPORTS_HZ)
+        return min(max(SOONEST_REPORT_S, len(self._living) / IDLE_REPORTS_HZ), LATEST_REPORT_S)
 
     def take_new_misfits(self) -> list[Misfit]:
         """Return the misfits that were found since the last call, each life of an actor once."""
@@ -208,7 +211,7 @@ class Intake:
             now: The caller's clock [s].
         """
         self._now = now
-        known = self._known(header)
+        known, account = self._known(header), self._accounts.get(header.life)
         case = Case(
             header=header,
             learner=self._learner_state,
@@ -217,6 +220,7 @@ class Intake:
             queue_limit=self._queue_limit(),
             version_at_use=self._version_at_use(),
             max_lag=self._config.max_lag,
+            credit_end=(account.credit_limit if account else 0) + self._config.window,
         )
         kind, reason = judge(case)
         if kind is VerdictKind.WRONG_RUN:
@@ -418,7 +422,8 @@ class Intake:
         account = self._accounts.get(key)
         if account is None or key in self._awaited or not account.published:
             return ""
-        most = max(account.published, account.credit_limit) + LONGEST_JUMP
+        jump = BEYOND_CREDITS if account.credit_limit else LONGEST_JUMP
+        most = max(account.published, account.credit_limit) + jump
         return "" if number <= most else f"number {number}; allowed: up to {most}"
 
     def _close(self, key: _Key) -> None:

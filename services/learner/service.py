@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass
 from threading import Event
 from typing import Final
 
-from common.comms.codec import encode
+from common.comms.codec import DecodeError, decode, encode
+from common.comms.keys import KeyPartError
 from common.comms.messages import ActorReport, StageChange, Verdict
-from common.comms.transport import Transport
+from common.comms.transport import Request, Transport
 from common.comms.zenoh_config import endpoint_for_others
 from common.env.robot import home_action
 from common.env.teacher import teacher_of
@@ -23,7 +24,7 @@ from common.service.member import LEARNER_ID, Member
 from common.service.metrics import Metrics
 from common.service.run_folder import RunFolder
 from services.learner import checkpoint, telemetry
-from services.learner.admission import LearnerState, open_rollout
+from services.learner.admission import LearnerState, differs, open_rollout
 from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
@@ -37,7 +38,8 @@ from services.learner.training import Training
 log = logging.getLogger(__name__)
 
 ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
-SERVED_AT_ONCE: Final = 64  # messages read between two gradient steps
+REPORT_MAILBOX: Final = 256  # more than all actors of a run send at once
+SERVED_AT_ONCE: Final = 64  # messages of a kind read between two gradient steps
 IDLE_WAIT_S: Final = 0.2  # any arrival ends the wait
 NAMES_LOGGED: Final = 5  # of services that joined or left together
 TOKENS_ARRIVE_S: Final = 0.5  # longest time that the tokens of others take to arrive through a router
@@ -88,7 +90,10 @@ class LearnerService:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
-        self._endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
+        endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
+        self._link = f"--endpoint {endpoint}" + (
+            f" --tls {config.tls}" if config.tls else ""
+        )  # flags for others
         self._folder = RunFolder.of(config.run, config.folder)
         if not config.resume and checkpoint.checkpoints(self._folder.checkpoints):
             raise RunExistsError(
@@ -126,8 +131,10 @@ class LearnerService:
         self._alive: set[tuple[str, str, int]] = set()
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
         keys = self._keys = self._member.keys
-        self._rollouts = transport.serve(keys.rollout(), capacity=ROLLOUT_MAILBOX)
+        self._rollouts = transport.serve(keys.every_rollout(), capacity=ROLLOUT_MAILBOX)
+        self._reports = transport.serve(keys.every_report(), capacity=REPORT_MAILBOX)
         self._member.watch("rollout", self._rollouts)
+        self._member.watch("report", self._reports)
         identity = Identity(
             config.run, self._generation, contract_hash(task, config.network), self._training_hash
         )
@@ -189,13 +196,13 @@ class LearnerService:
         config = self._config
         log.info(
             "%s endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
-            "--run %s --endpoint %s (and rallies with: python -m services.generator --run %s --endpoint %s)",
+            "--run %s %s (and rallies with: python -m services.generator --run %s %s)",
             "listening" if config.mode == "hub" else "connected",
             config.endpoint,
             config.run,
             self.training.progress.epoch,
             config.curriculum.epochs,
-            *(config.run, self._endpoint) * 2,
+            *(config.run, self._link) * 2,
         )
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
@@ -419,26 +426,54 @@ class LearnerService:
             )
         for request in self._rollouts.waiting(SERVED_AT_ONCE):
             self._metrics.inc("topspin_bytes_received_total", len(request.payload))
-            opened = open_rollout(
-                request.payload, self._config.max_message_mib * 2**20, self.training.obs_size
-            )
-            if opened is None:
-                self._member.refuse("rollout", "unreadable")
-                verdict = self._intake.unreadable("not readable as a rollout of this release")
-            else:
-                verdict = self._intake.arrive(*opened, now)
-                self._history.note(
-                    "verdict",
-                    rollout=[*opened[0].life, opened[0].sequence],
-                    kind=verdict.kind.value,
-                    generation=self._generation,
-                )
-                if opened[0].fault:
-                    self._member.refuse("rollout", f"actor={opened[0].actor} {opened[0].fault}")
+            verdict = self._judge(request, now)
             self._metrics.inc("topspin_rollouts_received_total", 1.0, verdict=verdict.kind.value)
             request.reply(encode(verdict))
-        self._member.answer_control(self._report)
+        for request in self._reports.waiting(SERVED_AT_ONCE):
+            self._answer_report(request, now)
+        self._member.answer_control()
         self._broadcast.answer()
+
+    def _judge(self, request: Request, now: float) -> Verdict:
+        """Return the verdict on a request with a rollout."""
+        opened = open_rollout(request.payload, self._config.max_message_mib * 2**20, self.training.obs_size)
+        if opened is None:
+            self._member.refuse("rollout", "unreadable")
+            return self._intake.unreadable("not readable as a rollout of this release")
+        header, rollout = opened
+        if fault := self._sender_fault(request.key, header.actor):
+            self._member.refuse("rollout", fault)
+            return self._intake.unreadable(fault)
+        if header.fault:
+            self._member.refuse("rollout", f"actor={header.actor} {header.fault}")
+        verdict = self._intake.arrive(header, rollout, now)
+        self._history.note(
+            "verdict",
+            rollout=[*header.life, header.sequence],
+            kind=verdict.kind.value,
+            generation=self._generation,
+        )
+        return verdict
+
+    def _answer_report(self, request: Request, now: float) -> None:
+        try:
+            report = decode(request.payload, ActorReport)
+        except DecodeError as error:
+            self._member.refuse("report", error)
+            request.refuse()
+            return
+        if fault := self._sender_fault(request.key, report.actor):
+            self._member.refuse("report", fault)
+            request.refuse()
+            return
+        request.reply(encode(self._intake.report(report, now)))
+
+    def _sender_fault(self, key: str, actor: str) -> str:
+        """Return why a message can't be of the actor that it names, or "": the key is the sender's own."""
+        try:
+            return differs("actor", actor, self._keys.sender(key))
+        except KeyPartError as error:
+            return str(error)
 
     def _follow_members(self) -> None:
         """Record which services have joined or gone, and log it: one line however many they are."""
@@ -476,9 +511,6 @@ class LearnerService:
             raise LearnerAliveError(text)
         log.error("%s; this one goes on, since it was first", text)
 
-    def _report(self, report: ActorReport) -> Verdict:
-        return self._intake.report(report, self._clock())
-
     def _warn_of_silence(self, now: float) -> None:
         since = max(self._clocks.last_trained, self._clocks.born)
         if self._warned or now - since < self._config.silence_warning_s:
@@ -487,10 +519,10 @@ class LearnerService:
         actors = sum(role == "actor" for role, _, _ in self._alive)
         if actors == 0:
             log.warning(
-                "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s --endpoint %s",
+                "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s %s",
                 now - since,
                 self._config.run,
-                self._endpoint,
+                self._link,
             )
         else:
             log.warning(

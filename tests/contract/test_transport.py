@@ -232,6 +232,26 @@ def test_a_wait_ends_with_any_arrival_even_one_before_the_wait(net):
     assert not actor.wait(0.01)
 
 
+def test_requests_that_were_left_waiting_end_the_next_wait(net):
+    hub, client = net.hub(), net.client()
+    server = hub.serve(f"{RUN}/ctl/learner/0", capacity=8)
+    answered(client, server, f"{RUN}/ctl/learner/0")
+    pending = [client.request(f"{RUN}/ctl/learner/0", b"", 5.0, Flow.CONTROL) for _ in range(3)]
+    taken = []
+
+    def take_one():
+        for request in server.waiting(1):
+            taken.append(request)
+            request.reply(b"")
+
+    until(lambda: (take_one(), taken)[1])
+    while len(taken) < 3:
+        assert hub.wait(5.0)  # and no new arrival ends it
+        take_one()
+
+    assert all(isinstance(request.wait(), Reply) for request in pending)
+
+
 def test_a_mailbox_needs_room_for_one(net):
     with pytest.raises(TransportError, match="capacity 0 of a mailbox; allowed: 1 or more"):
         net.hub().subscribe(f"{RUN}/stage", capacity=0)

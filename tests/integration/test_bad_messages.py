@@ -7,7 +7,7 @@ import numpy as np
 
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
-from common.comms.messages import PolicySnapshot, RallyBatch, StageChange, Status, Verdict
+from common.comms.messages import ActorReport, PolicySnapshot, RallyBatch, StageChange, Status, Verdict
 from common.comms.transport import Flow, NoReply
 from common.policy.weights import load_tensors, save_tensors
 from common.task.config import TaskConfig
@@ -17,6 +17,7 @@ from tests.unit.comms.test_codec import sealed
 from tests.unit.services.learner.rollouts import make_rollout
 
 KEYS = Keys("test")
+REPORT = ActorReport("test", "client", 1, 0, 0, (), (), 0, (), leaving=False)
 PAPER = TaskConfig(observation=PAPER_OBSERVATION)  # the task of the client's rollouts
 LONG = CURRICULUM.model_copy(update={"stage_1": 500})
 
@@ -24,8 +25,8 @@ LONG = CURRICULUM.model_copy(update={"stage_1": 500})
 class ForeignClient:
     """A program with a connection that can write rollouts."""
 
-    def __init__(self, transport):
-        self.transport = transport
+    def __init__(self, transport, name="client"):
+        self.transport, self.name = transport, name
         self.sent = 0
 
     def policy(self):
@@ -35,14 +36,14 @@ class ForeignClient:
 
     def rollout(self, **changes):
         """Return a rollout that the learner accepts, except for ``changes``."""
-        newest, values = self.policy(), {"actor": "client", "run": "test", "sequence": self.sent}
+        newest, values = self.policy(), {"actor": self.name, "run": "test", "sequence": self.sent}
         for name in ("generation", "version", "stage_number", "training_hash"):
             values[name] = getattr(newest, name)
         self.sent += 1
         return make_rollout(**(values | changes))
 
     def send(self, payload, key=None):
-        return self.transport.request(key or KEYS.rollout(), payload, 5.0, Flow.ROLLOUT).wait()
+        return self.transport.request(key or KEYS.rollout(self.name), payload, 5.0, Flow.ROLLOUT).wait()
 
     def verdict(self, payload):
         return decode(self.send(payload).payload, Verdict)
@@ -99,20 +100,24 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
             ("unreadable", "not readable", bytes(spoilt)),
             ("unreadable", "not readable", b""),
             ("unreadable", "not readable", encode(status())),
+            ("unreadable", "actor other; allowed: client", encode(client.rollout(actor="other"))),
         ]
         before = dict(learner.scrape())
         verdicts = [client.verdict(payload) for _, _, payload in bad]
         after = learner.scrape()
         refusal = client.send(b"nonsense", KEYS.ctl("learner", "0"))
-        token = client.transport.declare_alive("topspin/v1/test/alive/actor/x/²")
+        forged = client.send(encode(dataclasses.replace(REPORT, actor="other")), KEYS.report("client"))
+        token = client.transport.declare_alive("topspin/v2/test/alive/actor/x/²")
         wait_until(
             lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1,
             5,
             "the invalid token",
         )
         token.close()
+        paused = client.verdict(encode(client.rollout()))  # after so many refusals it has no credits
+        other = ForeignClient(s.peer(), "other")
         for _ in range(2):
-            client.verdict(encode(client.rollout()))
+            other.verdict(encode(other.rollout()))
         wait_until(lambda: client.policy().version == newest.version + 1, 20, "one more update")
         learner.end()
         ledger = learner.service.ledger()
@@ -123,7 +128,9 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
     for kind in {kind for kind, _, _ in bad}:
         name = f'topspin_rollouts_received_total{{verdict="{kind}"}}'
         assert after[name] - before.get(name, 0.0) == sum(k == kind for k, _, _ in bad)
+    assert "without a credit" in paused.reason
     assert refusal is NoReply.NO_SERVER
+    assert forged is NoReply.NO_SERVER
     assert ledger.balance == 0
     assert ledger.trained == 10
     assert ledger.lost == 0
@@ -134,7 +141,7 @@ def test_a_message_over_the_limit_is_dropped_and_others_are_still_served(tmp_pat
         learner = s.learner()
         client, other = ForeignClient(s.peer()), ForeignClient(s.peer())
         big = encode(client.rollout(**{n: getattr(make_rollout(steps=128, envs=96), n) for n in BLOCK}))
-        outcome = client.transport.request(KEYS.rollout(), big, 2.0, Flow.ROLLOUT).wait()
+        outcome = client.transport.request(KEYS.rollout("client"), big, 2.0, Flow.ROLLOUT).wait()
         for _ in range(2):
             assert other.verdict(encode(other.rollout())).kind == "accepted"
         wait_until(lambda: other.policy().version == 1, 20, "an update")

@@ -67,7 +67,7 @@ def test_credits_of_an_actor_that_reports_and_never_plays_go_to_others(tmp_path)
         idle = ActorReport("test", "idle", 1, 0, 0, (), (), 0, (), False, newest_policy(peer).training_hash)
 
         def report():
-            outcome = peer.request(KEYS.ctl("learner", "0"), encode(idle), 5.0, Flow.CONTROL).wait()
+            outcome = peer.request(KEYS.report("idle"), encode(idle), 5.0, Flow.CONTROL).wait()
             return decode(outcome.payload, Verdict) if isinstance(outcome, Reply) else None
 
         assert report().credit_limit == 1
@@ -102,6 +102,26 @@ def test_an_actor_comes_back_from_a_forged_version_of_its_own_learner(tmp_path, 
         trains_on(learner, 6)
 
     assert "is not from the learner" in caplog.text
+
+
+def test_an_actor_comes_back_from_forged_answers(tmp_path):
+    """At an open hub a peer can answer faster than the learner."""
+    with local_run(tmp_path, **ONE) as s:
+        learner, actor, peer = started(s)
+        kind = VerdictKind.CREDITS
+        forged = encode(Verdict(kind, kind, "", newest_policy(peer).generation, 0, 0, 1, 2**61, 2**61))
+        servers = [peer.serve(key, 64) for key in (KEYS.report("0"), KEYS.rollout("0"))]
+
+        def answer():
+            for server in servers:
+                for request in server.waiting(64):
+                    request.reply(forged)
+            return actor.service._outbox.credit_version == 2**61
+
+        wait_until(answer, 30, "forged credits")
+        for server in servers:
+            server.close()
+        trains_on(learner, 6)
 
 
 def test_a_second_learner_of_a_run_ends_with_one_line_and_the_first_goes_on(tmp_path, caplog):

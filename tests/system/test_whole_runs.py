@@ -6,11 +6,13 @@ import re
 import signal
 import time
 import tomllib
+from threading import Event
 
 import pytest
 
 from common.policy.folder import load_policy
 from tests.system.commands import STAGES, TINY, children_of, last_json, run, running, wait_until
+from topspin.certs import main
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 MEASURES = ("catch_rate", "over_rate", "return_rate", "return_after_catch")
@@ -24,14 +26,14 @@ def rows(folder, name="r"):
         return list(csv.DictReader(file))
 
 
-def test_a_run_goes_through_its_stages_and_leaves_a_complete_folder_and_one_json_line(tmp_path):
+def test_a_run_with_certificates_goes_through_its_stages_and_leaves_a_complete_folder_and_one_json_line(
+    tmp_path,
+):
+    main(["--out", str(tmp_path / "certs"), "--actors", "2"], Event())
     status, out, err = run(
         tmp_path,
         "deploy.local",
-        "--run",
-        "r",
-        "--actors",
-        2,
+        *("--run", "r", "--actors", 2, "--tls", "certs"),
         *TINY,
         *STAGES,
         "--learner.curriculum.stage-3",
@@ -63,6 +65,11 @@ def test_a_run_goes_through_its_stages_and_leaves_a_complete_folder_and_one_json
         path.stem for path in (folder / "logs").iterdir()
     }
     assert (tmp_path / "runs" / "latest").resolve() == folder
+    assert "endpoint=tls/127.0.0.1:" in err
+    for name in ("learner-0", "actor-0", "actor-1", "generator-0", "evaluator-0"):
+        assert f"link secured certificate=certs/{name}.pem" in (folder / "logs" / f"{name}.log").read_text()
+    assert "link secured certificate=certs/operator-0.pem" in err
+    assert "is not in the folder" not in (folder / "logs" / "learner-0.log").read_text()
 
 
 def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_interrupted_run_goes_on(tmp_path):

@@ -14,6 +14,7 @@ from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
+from topspin.certs import CertsConfig
 from topspin.evaluate import EvaluateConfig
 from topspin.export.command import ExportConfig
 from topspin.pictures import PicturesConfig
@@ -36,6 +37,7 @@ PROGRAMS: Final[dict[str, tuple[str, type[BaseModel]]]] = {
     "pictures": ("topspin pictures", PicturesConfig),
     "release": ("topspin release", ReleaseConfig),
     "export": ("topspin export", ExportConfig),
+    "certs": ("topspin certs", CertsConfig),
 }
 """Each program by its table in a settings file: how it is called, and what there is to set."""
 

@@ -12,7 +12,7 @@ BOOKKEEPING: Final = frozenset(
         *("run", "recipe", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
         *("silence_warning_s", "checkpoint_interval_s"),
         *("endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib"),
-        *("tls_ca", "tls_certificate", "tls_key", "metrics_host", "log_level", "status_interval_s"),
+        *("tls", "metrics_host", "log_level", "status_interval_s"),
     }
 )
 """Settings that name, monitor or connect a run: they do not distinguish experiments."""

@@ -78,6 +78,20 @@ def test_a_control_message_over_64_kib_is_refused_unread():
 
 
 @pytest.mark.parametrize(
+    ("field", "raw", "message"),
+    [
+        ("dropped", [-1], r"ActorReport\.dropped\[0\]: -1; allowed: 0 to"),
+        ("in_flight", [2**60], r"ActorReport\.in_flight\[0\]: 1152921504606846976; allowed: 0 to"),
+        ("in_flight", [1.5], r"ActorReport\.in_flight\[0\]: 1.5 of type float; allowed: int"),
+        ("dropped", list(range(257)), r"257 dropped; allowed: up to 256"),
+    ],
+)
+def test_the_numbers_in_a_report_are_bounded(field, raw, message):
+    with pytest.raises(DecodeError, match=message):
+        decode(with_field(REPORT, field, raw), ActorReport)
+
+
+@pytest.mark.parametrize(
     "name",
     ["", "a" * 65, "a/b", "a\nb", "a\x1b[2J", "-a", "a" * 15_000_000],
     ids=lambda name: repr(name)[:12],

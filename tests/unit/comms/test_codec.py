@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.comms.budgets import one_line
-from common.comms.codec import DecodeError, EncodeError, decode, decode_one_of, encode, salvage
+from common.comms.codec import DecodeError, EncodeError, decode, encode, salvage
 from common.comms.messages import (
     MESSAGES,
-    Control,
     Rollout,
     StageLog,
     Verdict,
@@ -167,12 +166,6 @@ BAD_OBS[2, 1, 3] = np.inf
 def test_a_bad_rollout_names_the_field_what_was_got_and_what_is_allowed(field, raw, message):
     with pytest.raises(DecodeError, match=message):
         decode(with_field(make_rollout(), field, raw), Rollout)
-
-
-def test_either_of_two_types_is_read_and_a_third_is_refused():
-    assert decode_one_of(encode(make_verdict()), (Control, Verdict)) == make_verdict()
-    with pytest.raises(DecodeError, match="type 'StageLog'; allowed here: Control or Verdict"):
-        decode_one_of(encode(StageLog(())), (Control, Verdict))
 
 
 def test_an_oversize_message_is_refused_before_it_is_read():

@@ -10,13 +10,14 @@ KEYS = Keys("night-1")
 @pytest.mark.parametrize(
     ("key", "text"),
     [
-        (KEYS.policy(), "topspin/v1/night-1/policy"),
-        (KEYS.stage(), "topspin/v1/night-1/stage"),
-        (KEYS.rollout(), "topspin/v1/night-1/rollout"),
-        (KEYS.rally(3), "topspin/v1/night-1/rally/3"),
-        (KEYS.ctl("actor", "a-0"), "topspin/v1/night-1/ctl/actor/a-0"),
-        (KEYS.alive("actor", "a-0", 12), "topspin/v1/night-1/alive/actor/a-0/12"),
-        (KEYS.status("learner", "l"), "topspin/v1/night-1/status/learner/l"),
+        (KEYS.policy(), "topspin/v2/night-1/policy"),
+        (KEYS.stage(), "topspin/v2/night-1/stage"),
+        (KEYS.rollout("0"), "topspin/v2/night-1/rollout/0"),
+        (KEYS.report("lab-1"), "topspin/v2/night-1/report/lab-1"),
+        (KEYS.rally(3), "topspin/v2/night-1/rally/3"),
+        (KEYS.ctl("actor", "a-0"), "topspin/v2/night-1/ctl/actor/a-0"),
+        (KEYS.alive("actor", "a-0", 12), "topspin/v2/night-1/alive/actor/a-0/12"),
+        (KEYS.status("learner", "l"), "topspin/v2/night-1/status/learner/l"),
     ],
 )
 def test_keys_are_as_documented(key, text):
@@ -48,10 +49,10 @@ def test_a_liveliness_key_names_its_member(role, id_, incarnation):
 
 
 @pytest.mark.parametrize(
-    "key", ["", "topspin/v1/other/alive/actor/a/1", KEYS.policy(), f"{KEYS.alive('actor', 'a', 1)}/x"]
+    "key", ["", "topspin/v2/other/alive/actor/a/1", KEYS.policy(), f"{KEYS.alive('actor', 'a', 1)}/x"]
 )
 def test_a_key_that_is_not_a_liveliness_key_is_refused(key):
-    with pytest.raises(KeyPartError, match="is not topspin/v1/night-1/alive/"):
+    with pytest.raises(KeyPartError, match="is not topspin/v2/night-1/alive/"):
         KEYS.member(key)
 
 

@@ -1,9 +1,11 @@
 import pytest
 from pydantic import ValidationError
 
-from common.comms.zenoh_config import ZenohConfig, endpoint_for_others, session_settings
+from common.comms.certificates import files_of
+from common.comms.roles import access_control
+from common.comms.zenoh_config import Security, ZenohConfig, endpoint_for_others, session_settings
 
-FILES = {"tls_ca": "ca.pem", "tls_certificate": "learner.pem", "tls_key": "learner.key"}
+SECURITY = Security(files_of("certs", "learner-0"), ("actor-0",), access_control(["actor-0"], "r"))
 
 
 def test_only_the_hub_listens_and_only_clients_connect_to_it():
@@ -47,11 +49,23 @@ def test_the_endpoint_for_others_is_one_that_they_can_reach(endpoint, wanted):
     assert endpoint_for_others(endpoint, "hall") == wanted
 
 
-def test_a_tls_endpoint_and_only_that_needs_certificates():
-    settings = session_settings(ZenohConfig(endpoint="tls/site:7447", **FILES), attempt_s=2.0)
+def test_with_tls_links_are_mutual_and_the_hub_applies_the_roles():
+    config = ZenohConfig(endpoint="tls/site:7447", tls="certs", mode="hub")
+    settings = session_settings(config, attempt_s=2.0, security=SECURITY)
 
     assert settings["transport/link/protocols"] == ["tls"]
     assert settings["transport/link/tls"]["enable_mtls"] is True
-    for bad in ({"endpoint": "tls/site:7447"}, FILES, {"endpoint": "tls/site:7447", "tls_ca": "ca.pem"}):
-        with pytest.raises(ValidationError, match="allowed: all three with tls/"):
-            ZenohConfig(**bad)
+    assert settings["access_control"]["default_permission"] == "deny"
+
+
+def test_a_hub_that_applies_roles_has_no_peers():
+    with pytest.raises(ValidationError, match=r"peers tls/b:1 with --tls certs; allowed: one hub"):
+        ZenohConfig(endpoint="tls/a:1", tls="certs", peers=("tls/b:1",))
+
+
+@pytest.mark.parametrize("bad", [{"endpoint": "tls/site:7447"}, {"tls": "certs"}])
+def test_a_tls_endpoint_and_only_that_needs_certificates(bad):
+    with pytest.raises(
+        ValidationError, match=r"allowed: an endpoint tls/... with --tls DIR, any other without"
+    ):
+        ZenohConfig(**bad)

@@ -1,10 +1,13 @@
 import socket
 import tomllib
 from contextlib import suppress
+from pathlib import Path
+from threading import Event
 
 import pytest
 
-from common.service.config import ConfigError, load
+from common.comms.certificates import CertificateError
+from common.service.config import ConfigError, load, read_toml
 from common.service.run_folder import RunAliveError, RunFolder
 from deploy.config import DeployConfig
 from deploy.prepare import (
@@ -19,6 +22,7 @@ from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
+from topspin.certs import main
 
 CONFIG = DeployConfig(actors=3, generators=2, seed=7, metrics_port=9100)
 SERVICES = {
@@ -244,16 +248,17 @@ def test_for_a_live_run_deploy_is_named_before_its_learner(tmp_path, monkeypatch
             prepared(read("--run", run.name, *flags)).__enter__()
 
 
-TLS = ("--tls-ca", "ca.pem", "--tls-certificate", "hub.pem", "--tls-key", "hub.key")
-
-
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
         (("--endpoint", "foo"), r"local.endpoint = 'foo' \(--endpoint\); allowed: text, matching .*tcp\|tls"),
-        (("--endpoint", "tls/site:7447"), "allowed: all three with tls/..., none without"),
-        (("--endpoint", "tls/site:7447", *TLS[:4]), "allowed: all three with tls/..., none without"),
-        (TLS, "allowed: all three with tls/..., none without"),
+        (("--endpoint", "tls/site:7447"), "allowed: an endpoint tls/... with --tls DIR"),
+        (("--endpoint", "tcp/site:7447", "--tls", "certs"), "allowed: an endpoint tls/... with --tls DIR"),
+        (
+            ("--tls", "certs", "--actors", "2"),
+            "--tls certs has no certificate of learner-0,evaluator-0,generator-0,actor-0,actor-1,operator-0; "
+            "make them with: topspin certs --out certs --add learner-0,",
+        ),
     ],
 )
 def test_an_endpoint_that_no_service_could_reach_is_refused_before_anything_is_written(
@@ -266,14 +271,17 @@ def test_an_endpoint_that_no_service_could_reach_is_refused_before_anything_is_w
     assert not list(tmp_path.iterdir())
 
 
-def test_the_run_itself_reaches_the_hub_with_the_certificates_of_its_services():
-    config = read("--endpoint", "tls/site:7447", *TLS)
+def test_a_run_with_tls_listens_with_it_and_checks_every_certificate(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    main(["--days", "1"], Event())
+    with prepared(read("--run", "r", "--tls", "certs")) as run:
+        link, written = run.link, read_toml(run.folder.config)
+    Path("certs/actor-0.key").write_text("no key")
+    with pytest.raises(CertificateError, match=r"actor-0.key can't be read as a key"):
+        prepared(read("--run", "s", "--tls", "certs")).__enter__()
 
-    link = link_to_learner(config, config.endpoint)
-
-    assert (link.endpoint, link.tls_ca, link.tls_certificate, link.tls_key) == (
-        *("tls/site:7447", "ca.pem", "hub.pem", "hub.key"),
-    )
+    assert (link.endpoint.partition("/")[0], link.tls) == ("tls", "certs")
+    assert (written["endpoint"], written["tls"]) == (link.endpoint, "certs")
 
 
 def test_a_resumed_run_with_a_spent_budget_names_the_limit(tmp_path):

@@ -5,6 +5,7 @@ from services.actor import outbox as ob
 from services.actor.outbox import Outbox, OutboxConfig, OutboxFullError
 from tests.unit.services.accounting import make_verdict
 
+FAR = 2**62
 CONFIG = OutboxConfig(retry_first_s=1.0, retry_max_s=5.0, give_up_s=100.0)
 
 
@@ -107,6 +108,18 @@ def test_credits_never_shrink_within_a_generation_and_restart_with_the_next():
     outbox = ob.credited(outbox, make_verdict(VerdictKind.CREDITS, generation=2, credit_limit=2))
 
     assert outbox.credit_limit == 2
+
+
+def test_credits_that_the_learner_did_not_give_end_with_its_next_answer():
+    given = ob.credited(Outbox(CONFIG), make_verdict(VerdictKind.CREDITS, credit_limit=1, credit_version=10))
+    forged = ob.credited(given, make_verdict(VerdictKind.CREDITS, credit_limit=FAR, credit_version=FAR))
+    true = make_verdict(VerdictKind.CREDITS, credit_limit=2, credit_version=11)
+    refused = make_verdict(VerdictKind.INVALID, credit_limit=0)
+
+    assert ob.idle_reason(forged, generation=1, version=11) == f"policy version {FAR}"
+    assert ob.idle_reason(ob.credited(forged, true, (FAR, FAR)), generation=1, version=11) == ""
+    beyond = ob.offer(ob.offer(forged, b"", 0.0), b"", 0.0)
+    assert ob.answered(beyond, 1, refused, 0.0).credit_limit == 0
 
 
 def test_a_report_lists_what_the_current_learner_cannot_know():

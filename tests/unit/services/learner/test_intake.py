@@ -10,10 +10,10 @@ from services.actor.outbox import Flight, Outbox, OutboxConfig, report
 from services.learner import intake as intake_module
 from services.learner.admission import RULES, open_rollout
 from services.learner.intake import (
+    BEYOND_CREDITS,
     EARLIER,
     FOLD_AFTER_S,
     IDLE_REPORTS_HZ,
-    LONGEST_JUMP,
     SOONEST_REPORT_S,
     Intake,
     IntakeConfig,
@@ -169,7 +169,7 @@ def test_a_token_without_messages_makes_no_account():
 
 
 def test_a_dead_actors_missing_rollouts_are_lost_until_its_token_returns():
-    intake = make_intake()
+    intake = make_intake(window=5)
     intake.arrive(make_header(3), ROLLOUT, 0.0)
     assert intake.ledgers()["actor-0", 1].in_flight == 4
     assert intake.gaps() == 3
@@ -420,9 +420,18 @@ def test_a_number_far_beyond_those_of_its_actor_changes_no_account():
     answer = intake.report(claim, 0.0)
 
     assert wild.kind is VerdictKind.INVALID
-    assert wild.reason == f"number {2**53}; allowed: up to {3 + LONGEST_JUMP}"
+    assert wild.reason == f"number {2**53}; allowed: up to {3 + BEYOND_CREDITS}"
     assert answer.credit_limit == 0
     assert intake.total() == before
+
+
+def test_an_actor_that_sends_without_credits_fills_no_queue():
+    intake = make_intake(dataset_rollouts=2, max_lag=64, window=2)
+    verdicts = [intake.arrive(make_header(number), ROLLOUT, 0.0) for number in range(40)]
+    accepted = sum(verdict.kind is VerdictKind.ACCEPTED for verdict in verdicts)
+
+    assert accepted == intake.queued == 2 * 2 + 2  # two datasets, and a window of slack
+    assert "number 6 without a credit; allowed: less than 6" in verdicts[6].reason
 
 
 def test_a_peer_of_many_names_gets_a_bounded_number_of_accounts(monkeypatch):

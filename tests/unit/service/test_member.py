@@ -1,0 +1,28 @@
+"""A service as a member of its run."""
+
+import pytest
+
+from common.comms.codec import decode, encode
+from common.comms.keys import Keys
+from common.comms.memory_transport import MemoryBroker
+from common.comms.messages import Command, Control, ControlReply
+from common.comms.transport import Flow
+from common.service.member import Member
+from common.service.metrics import Metrics
+from common.service.settings import ServiceConfig
+
+
+@pytest.mark.parametrize("tls", [True, False])
+def test_a_service_drains_on_command_only_where_the_hub_knows_who_commands(tls):
+    secured = {"endpoint": "tls/hall:7447", "tls": "certs"} if tls else {}
+    broker, config = MemoryBroker(), ServiceConfig(run="r", id="3", **secured)
+    hub, operator = broker.open(hub=True), broker.open()
+    member = Member("actor", config, hub, Metrics("actor", "3"), 1)
+    pending = operator.request(Keys("r").ctl("actor", "3"), encode(Control(Command.DRAIN)), 5.0, Flow.CONTROL)
+    member.answer_control()
+    reply = decode(pending.wait().payload, ControlReply)
+
+    assert (member.is_draining, reply.ok) == (tls, tls)
+    assert reply.reason == (
+        "" if tls else "commands need TLS (--tls): on an open hub anybody could send them"
+    )
