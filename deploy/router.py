@@ -47,7 +47,9 @@ class RouterConfig(ZenohConfig):
     @model_validator(mode="after")
     def _is_open(self) -> Self:
         if self.tls:
-            raise ValueError(f"tls {self.tls}; allowed: none: with TLS the learner is the hub, since it has the rules")
+            raise ValueError(
+                f"tls {self.tls}; allowed: none: with TLS the learner is the hub, since it has the rules"
+            )
         return self
 
 

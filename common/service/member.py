@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final, Protocol
 
 from common.comms.budgets import one_line
@@ -22,6 +23,15 @@ from common.service.settings import ServiceConfig
 log = logging.getLogger(__name__)
 
 LEARNER_ID: Final = "0"  # a run has one learner
+REFUSED_KINDS: Final = MappingProxyType(
+    {
+        "learner": ("control", "alive", "contract", "report", "rollout"),
+        "actor": ("control", "alive", "policy", "rally", "stage", "verdict"),
+        "generator": ("control", "request"),
+        "evaluator": ("control", "policy"),
+    }
+)
+"""What each role may refuse. Its counters begin at 0: from nothing to 1 is no rise for Prometheus."""
 REFUSALS_LOGGED: Final = 20  # lines a minute for each kind of refused message; all are counted
 CONTROL_MAILBOX: Final = 16  # commands that wait
 ON_AN_OPEN_HUB: Final = "commands need TLS (--tls): on an open hub anybody could send them"
@@ -92,7 +102,8 @@ class Member:
         self._refusals: dict[str, RefusalLog] = {}
         self._link_lost: float | None = None  # [s]
         self._endpoint, self._takes_commands = config.endpoint, bool(config.tls)
-        metrics.inc("topspin_messages_refused_total", 0.0, kind="control")
+        for kind in REFUSED_KINDS[role]:
+            metrics.inc("topspin_messages_refused_total", 0.0, kind=kind)
 
     def join(self) -> None:
         """Declare the liveliness token: the service can answer now."""

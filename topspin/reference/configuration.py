@@ -10,6 +10,7 @@ from pydantic_core import PydanticUndefined
 from common.service.config import SHARED, TABLES, flag_of
 from common.service.config_help import Setting, settings_of
 from deploy.config import DeployConfig
+from deploy.router import RouterConfig
 from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig
@@ -30,6 +31,7 @@ PROGRAMS: Final[dict[str, tuple[str, type[BaseModel]]]] = {
     "actor": ("python -m services.actor", ActorConfig),
     "generator": ("python -m services.generator", GeneratorConfig),
     "evaluator": ("python -m services.evaluator", EvaluatorConfig),
+    "router": ("python -m deploy.router", RouterConfig),
     "play": ("topspin play", PlayConfig),
     "evaluate": ("topspin evaluate", EvaluateConfig),
     "report": ("topspin report", ReportConfig),

@@ -5,6 +5,7 @@ from typing import Final
 
 from common.service import metrics
 from common.task import observation_reference
+from deploy.manifests import alarms
 from topspin.reference import configuration, protocol, robots, sequences, state_diagram
 
 FOLDER: Final = Path("docs/reference")  # from the project's folder
@@ -16,6 +17,7 @@ def files() -> dict[str, str]:
         "observation.md": observation_reference.markdown(),
         "robots.md": robots.markdown(),
         "metrics.md": metrics.markdown(),
+        "alarms.md": alarms.markdown(),
         "protocol.md": protocol.markdown(),
         "configuration.md": configuration.markdown(),
         "states.svg": state_diagram.svg(),

@@ -13,7 +13,7 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from common.service.config import load
+from common.service.config import ConfigError, load
 from deploy.manifests import compose, hosts, kubernetes
 from deploy.manifests.files import FOLDER, files
 from deploy.manifests.site import ROUTER, SITE
@@ -162,6 +162,20 @@ def test_a_pod_is_scaled_by_the_hunger_that_a_rule_records():
     assert scaler["spec"]["maxReplicas"] == SITE.actors
 
 
+def test_with_tls_the_learner_listens_and_the_others_look_for_it_by_the_name_of_its_service(tmp_path):
+    text = files()["cluster/kubernetes/tls/config.toml"]
+    (patch,) = [
+        d for d in documents("tls") if (d["kind"], d["metadata"]["name"]) == ("StatefulSet", "learner")
+    ]
+    words = patch["spec"]["template"]["spec"]["containers"][0]["args"]
+
+    learner = read_by_its_program([word.replace("$(POD_INDEX)", "0") for word in words], tmp_path, text)
+    actor = read_by_its_program(ROLES[-1].arguments("3", "config.toml", "9100"), tmp_path, text)
+
+    assert (learner.mode, learner.endpoint, learner.tls) == ("hub", "tls/0.0.0.0:7447", "/etc/topspin/tls")
+    assert (actor.mode, actor.endpoint, actor.tls, actor.id) == ("client", "tls/hub:7447", learner.tls, "3")
+
+
 @needs("kubectl")
 @pytest.mark.parametrize("folder", ["base", "tls"])
 def test_kustomize_builds_what_the_schemas_allow_with_one_hub(folder):
@@ -214,6 +228,11 @@ def test_the_dockerfile_names_only_what_is_there():
     assert [name for name in sources if not (root / name).exists()] == []
     allowed = {line[1:] for line in (root / ".dockerignore").read_text().splitlines() if line.startswith("!")}
     assert {name.split("/")[0] for name in sources} <= allowed
+
+
+def test_a_router_with_certificates_is_refused_since_the_hub_applies_the_rules(tmp_path):
+    with pytest.raises(ConfigError, match="tls certs; allowed: none: with TLS the learner is the hub"):
+        read_by_its_program(("deploy.router", "--endpoint", "tls/0.0.0.0:1", "--tls", "certs"), tmp_path, "")
 
 
 def test_the_router_listens_where_its_manifest_says(tmp_path):

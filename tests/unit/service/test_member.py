@@ -1,5 +1,8 @@
 """A service as a member of its run."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from common.comms.codec import decode, encode
@@ -7,7 +10,7 @@ from common.comms.keys import Keys
 from common.comms.memory_transport import MemoryBroker
 from common.comms.messages import Command, Control, ControlReply
 from common.comms.transport import Flow
-from common.service.member import Member
+from common.service.member import REFUSED_KINDS, Member
 from common.service.metrics import Metrics
 from common.service.settings import ServiceConfig
 
@@ -26,3 +29,13 @@ def test_a_service_drains_on_command_only_where_the_hub_knows_who_commands(tls):
     assert reply.reason == (
         "" if tls else "commands need TLS (--tls): on an open hub anybody could send them"
     )
+
+
+@pytest.mark.parametrize("role", REFUSED_KINDS)
+def test_every_kind_that_a_service_refuses_counts_from_0(role):
+    sources = (Path(__file__).parents[3] / "services" / role).glob("*.py")
+    refused = {
+        kind for path in sources for kind in re.findall(r'member\.refuse\(\s*"(\w+)"', path.read_text())
+    }
+
+    assert refused | {"control"} == set(REFUSED_KINDS[role])
