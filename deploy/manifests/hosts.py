@@ -43,6 +43,7 @@ StateDirectory=topspin
 CacheDirectory=topspin
 Environment=XDG_CACHE_HOME=/var/cache/topspin OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 DynamicUser=yes
+User=topspin
 Restart={restart}
 RestartSec=2
 RestartPreventExitStatus=2
@@ -57,7 +58,7 @@ ProtectSystem=strict
 ProtectHome=yes
 ProtectKernelTunables=yes
 ProtectControlGroups=yes
-RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX
+RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK
 CapabilityBoundingSet=
 
 [Install]

@@ -172,7 +172,7 @@ def test_with_tls_the_learner_listens_and_the_others_look_for_it_by_the_name_of_
     learner = read_by_its_program([word.replace("$(POD_INDEX)", "0") for word in words], tmp_path, text)
     actor = read_by_its_program(ROLES[-1].arguments("3", "config.toml", "9100"), tmp_path, text)
 
-    assert (learner.mode, learner.endpoint, learner.tls) == ("hub", "tls/0.0.0.0:7447", "/etc/topspin/tls")
+    assert (learner.mode, learner.endpoint, learner.tls) == ("hub", "tls/0.0.0.0:7447", "/etc/topspin-tls")
     assert (actor.mode, actor.endpoint, actor.tls, actor.id) == ("client", "tls/hub:7447", learner.tls, "3")
 
 
