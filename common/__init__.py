@@ -15,5 +15,5 @@ Layers
     ``physics``, ``task``, ``perception`` and ``rally`` use numpy and numba, and pydantic for settings. Other
     libraries have one place each: msgpack in ``comms/codec.py``, Zenoh in ``comms/zenoh_transport.py``, Prometheus
     in ``service/metrics.py``, MuJoCo in ``env/`` (its renderer in ``topspin/render/``), torch in ``policy/``, the
-    learner and the actor. Plots, pages, films, fits and Gymnasium are in ``topspin/`` alone.
+    learner and the actor. Plots, pages, films, fits, ONNX and Gymnasium are in ``topspin/`` alone.
 """

@@ -2,16 +2,20 @@
 
 numba's own cache notices a change of the file that holds a kernel, but not of the files it calls into: after
 an edit of ``vec.py`` every other kernel would still run the old code. So the cache folder is named after the
-content of all kernel sources, and an edit anywhere starts a fresh one.
+content of all kernel sources, and an edit anywhere starts a fresh one. It is beside the sources, or in the user's own
+cache where the sources belong to someone else.
 """
 
 import hashlib
+import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
 import numba
+
+log = logging.getLogger(__name__)
 
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
@@ -36,14 +40,42 @@ def _source_digest() -> str:
     return digest.hexdigest()[:16]
 
 
+def user_cache() -> list[Path]:
+    """Return the user's folder for compiled kernels; none where the user has no home."""
+    try:
+        return [Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "topspin" / "numba"]
+    except RuntimeError:  # no HOME, and no entry in the table of users
+        return []
+
+
+def writable_cache(candidates: list[Path]) -> Path | None:
+    """Return the first folder that can be written, made if need be; None, with one line in the log: there is none."""
+    for folder in candidates:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    log.warning(
+        "compiled kernels can't be kept, so every start compiles for a minute: no writable folder among %s",
+        ", ".join(map(str, candidates)),
+    )
+    return None
+
+
+_keeps = True
 if "NUMBA_CACHE_DIR" not in os.environ:
-    # numba makes its settings attributes when it is imported
-    numba.config.CACHE_DIR = str(_ROOT / ".numba_cache" / _source_digest())  # type: ignore[attr-defined]
+    _folder = writable_cache([_ROOT / ".numba_cache", *user_cache()])
+    _keeps = _folder is not None
+    if _folder is not None:
+        # numba makes its settings attributes when it is imported
+        numba.config.CACHE_DIR = str(_folder / _source_digest())  # type: ignore[attr-defined]
 
 
 def kernel(function: _Kernel) -> _Kernel:
     """Return ``function`` compiled: cached, GIL released, no fastmath: equal inputs give equal bits."""
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    compiled: Any = numba.njit(cache=_keeps, nogil=True, error_model="numpy")(function)
     return cast(_Kernel, compiled)
 
 
@@ -54,5 +86,5 @@ def inlined(function: _Kernel) -> _Kernel:
     the parts of a step cost 20 % less. Where a kernel has many such calls, only those on every step's way are inlined,
     because each one lengthens the compilation.
     """
-    compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
+    compiled: Any = numba.njit(cache=_keeps, nogil=True, error_model="numpy", forceinline=True)(function)
     return cast(_Kernel, compiled)

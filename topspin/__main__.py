@@ -67,6 +67,12 @@ def _release(argv: Sequence[str], stop: Event) -> int:
     return main(argv, stop)
 
 
+def _export(argv: Sequence[str], stop: Event) -> int:
+    from topspin.export.command import main
+
+    return main(argv, stop)
+
+
 @dataclass(frozen=True, slots=True)
 class Command:
     """A subcommand."""
@@ -82,6 +88,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "report": Command(_report, "compare runs: tables and plots beside the paper's"),
     "real2sim": Command(_real2sim, "play recordings of real balls"),
     "pictures": Command(_pictures, "draw stills of a policy's best rally"),
+    "export": Command(_export, "write a policy as a folder for a robot: ONNX, contract, wheel"),
     "certs": Command(_certs, "make certificates, with which a run is encrypted and roles hold"),
     "release": Command(_release, "put a policy into the box, with its measures"),
 }

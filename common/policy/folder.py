@@ -25,7 +25,7 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.contract import Contract, PolicyError, described, same_numbers
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import load_state, new_network, observation_moments, state_tensors
-from common.task.observation import ACTION, ACTION_SIZE, policy_layout, size
+from common.task.observation import ACTION, ACTION_SIZE, offsets, policy_layout, size
 
 WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _ACTING: Final = ("trunk.", "mean.", "log_std")  # the policy's parameters; the others are the critic's
@@ -42,12 +42,25 @@ class Policy:
     contract: Contract
 
     def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is used."""
+        """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is used.
+
+        Raises:
+            ValueError: An observed number is not finite; the text names it.
+        """
         width = self.network.obs_size
+        if not np.isfinite(obs[:, :width]).all():
+            raise ValueError(self._not_finite(obs[:, :width]))
         with torch.inference_mode():
             mean = self.network.act(torch.from_numpy(normalize(obs[:, :width], self.moments.first(width))))
         actions: npt.NDArray[np.float32] = mean.numpy()
         return actions
+
+    def _not_finite(self, obs: npt.NDArray[np.float32]) -> str:
+        """Return what is wrong with observations (B, D): the first number that is not finite, by name."""
+        row, column = np.argwhere(~np.isfinite(obs))[0]
+        parts = offsets(policy_layout(self.contract.task.observation))
+        name, part = next((n, p) for n, p in parts.items() if p.start <= column < p.stop)
+        return f"observation {row}: {name}[{column - part.start}] is {obs[row, column]}; allowed: a finite number"
 
 
 def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:

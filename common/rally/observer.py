@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from common.perception.flight_track import new_tracks
-from common.physics.chain import Chain
+from common.perception.flight_track import SERVED, new_tracks
+from common.physics.chain import JOINTS, Chain
 from common.rally.observe import observation_flags, observe
 from common.rally.sensing import update_flight_filter
 from common.rally.state import allocate
@@ -23,6 +23,8 @@ from common.task.observation import ObservationConfig, policy_layout, size
 from common.task.randomization import PROFILES, RallyParameter
 
 Floats = npt.NDArray[np.float32]
+
+_STATES = (0, 1, 2, 3, int(SERVED))
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +37,15 @@ class BallSample:
     state: int
     moment: float  # [s] time stamp, on the robot's clock
     is_guess: bool = False  # the camera filter has too few detections yet: ``camera_filter.is_guess``
+
+
+def check_finite(name: str, values: npt.ArrayLike, size: int) -> None:
+    """Raise ValueError unless ``values`` are ``size`` finite numbers; its text names the first that is not."""
+    numbers = np.asarray(values, np.float64).ravel()
+    if numbers.size != size:
+        raise ValueError(f"{name} has {numbers.size} numbers; allowed: {size}")
+    for k in np.flatnonzero(~np.isfinite(numbers)):
+        raise ValueError(f"{name}[{k}] is {numbers[k]}; allowed: a finite number")
 
 
 class Observer:
@@ -63,7 +74,8 @@ class Observer:
             )
         self._options, self._chain = options, chain
         self._noise = position_noise, velocity_noise
-        self._rally, _ = allocate(1, options.history, tracks=new_tracks(1, options.expected_spin))
+        tracks = new_tracks(1 if options.is_tracked else 0, options.expected_spin)
+        self._rally, _ = allocate(1, options.history, tracks=tracks)
         self._flags = observation_flags(options)._replace(is_privileged=False)
         self._is_first = True
 
@@ -71,8 +83,9 @@ class Observer:
         """Begin a new ball of the same opponent. ``target`` is where to return it [m]: x in 0..1.37, y in -0.76..0.76.
 
         With ``expected_spin`` learnt the observer keeps what it has learnt about the opponent's spin. Make a new
-        Observer for a new opponent.
+        Observer for a new opponent. Raises ValueError for a target that is not finite.
         """
+        check_finite("target", target, 2)
         self._rally.parameters[0, [RallyParameter.TARGET_X, RallyParameter.TARGET_Y]] = target
         self._is_first = True
 
@@ -86,7 +99,18 @@ class Observer:
             joint_pos: (7,) from the robot's base to its racket [m, rad].
             joint_vel: (7,) [m/s, rad/s].
             ball: The newest sample; if there is no new one, the last sample again.
+
+        Raises:
+            ValueError: A number is not finite, is missing, or is no trajectory state. Nothing has changed then.
         """
+        check_finite("now", now, 1)
+        check_finite("joint_pos", joint_pos, JOINTS)
+        check_finite("joint_vel", joint_vel, JOINTS)
+        check_finite("ball.pos", ball.pos, 3)
+        check_finite("ball.vel", ball.vel, 3)
+        check_finite("ball.moment", ball.moment, 1)
+        if ball.state not in _STATES:
+            raise ValueError(f"ball.state is {ball.state}; allowed: {', '.join(map(str, _STATES))}")
         rally = self._rally
         measurement, history = rally.measurement[0], rally.measurement_history[0]
         history[1:] = history[:-1].copy()
@@ -95,16 +119,17 @@ class Observer:
         measurement[:] = [*ball.pos, *ball.vel, ball.state, ball.moment - now]
         if self._is_first:
             history[:] = measurement[:6]
-        update_flight_filter(
-            rally.track[0], measurement, ball.moment, now, self._is_first, ball.is_guess, *self._noise
-        )
+        if self._options.is_tracked:
+            update_flight_filter(
+                rally.track[0], measurement, ball.moment, now, self._is_first, ball.is_guess, *self._noise
+            )
         self._is_first = False
         obs = np.empty((1, size(policy_layout(self._options))), np.float32)
         observe(
             rally,
             np.zeros(1, np.int64),
-            np.array(joint_pos, np.float64).reshape(1, 7),
-            np.array(joint_vel, np.float64).reshape(1, 7),
+            np.array(joint_pos, np.float64).reshape(1, JOINTS),
+            np.array(joint_vel, np.float64).reshape(1, JOINTS),
             self._chain,
             self._flags,
             obs,

@@ -36,7 +36,7 @@ ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
 TABLES: Final = (
     *("task", "experience", "network"),
     *("generator", "actor", "learner", "evaluator"),
-    *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "certs", "bench"),
+    *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "export", "certs", "bench"),
 )
 """Tables of a settings file. A nested model of one of these names is read from that table, whatever the program."""
 SHARED: Final = (

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from common.jit import KERNEL_ROOMS
+from common.jit import KERNEL_ROOMS, writable_cache
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("common", "services", "deploy", "topspin")
@@ -35,3 +35,20 @@ def test_every_file_with_a_kernel_is_in_a_folder_that_names_the_cache():
 @pytest.mark.parametrize("room", KERNEL_ROOMS)
 def test_every_folder_that_names_the_cache_has_a_kernel(room):
     assert any(file.startswith(f"{room}/") for file in files_with_kernels())
+
+
+def test_kernels_are_kept_in_the_first_folder_that_can_be_written(tmp_path):
+    (tmp_path / "file").touch()
+    blocked, first, second = tmp_path / "file" / "cache", tmp_path / "a" / "cache", tmp_path / "b"
+
+    assert writable_cache([blocked, first, second]) == first
+    assert first.is_dir()
+    assert not second.exists()
+
+
+def test_where_kernels_cannot_be_kept_one_line_says_so(tmp_path, caplog):
+    (tmp_path / "file").touch()
+
+    assert writable_cache([tmp_path / "file" / "cache"]) is None
+    assert "every start compiles" in caplog.text
+    assert len(caplog.records) == 1

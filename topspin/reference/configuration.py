@@ -16,6 +16,7 @@ from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
 from topspin.certs import CertsConfig
 from topspin.evaluate import EvaluateConfig
+from topspin.export.command import ExportConfig
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
 from topspin.real2sim.config import Real2SimConfig
@@ -35,6 +36,7 @@ PROGRAMS: Final[dict[str, tuple[str, type[BaseModel]]]] = {
     "real2sim": ("topspin real2sim", Real2SimConfig),
     "pictures": ("topspin pictures", PicturesConfig),
     "release": ("topspin release", ReleaseConfig),
+    "export": ("topspin export", ExportConfig),
     "certs": ("topspin certs", CertsConfig),
 }
 """Each program by its table in a settings file: how it is called, and what there is to set."""

@@ -86,6 +86,44 @@ def test_a_policy_in_the_box_acts_on_an_observation(name):
     assert np.isfinite(action).all()
 
 
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"joint_pos": [0.0] * 6 + [np.nan]}, r"joint_pos\[6\] is nan; allowed: a finite number"),
+        ({"joint_vel": [np.inf] + [0.0] * 6}, r"joint_vel\[0\] is inf"),
+        ({"joint_vel": [0.0] * 6}, "joint_vel has 6 numbers; allowed: 7"),
+        ({"now": np.nan}, r"now\[0\] is nan"),
+        ({"pos": (1.0, np.nan, 0.3)}, r"ball.pos\[1\] is nan"),
+        ({"vel": (1.0, 0.0, -np.inf)}, r"ball.vel\[2\] is -inf"),
+        ({"moment": np.nan}, r"ball.moment\[0\] is nan"),
+        ({"state": 7}, "ball.state is 7; allowed: 0, 1, 2, 3, 4"),
+    ],
+)
+def test_a_bad_measurement_is_refused_by_name_and_leaves_no_trace(change, line):
+    ball = {"pos": (1.0, 0.2, 0.3), "vel": (-6.0, 0.5, 1.0), "state": 0, "moment": 0.0}
+    robot = {"now": 0.02, "joint_pos": [0.1] * 7, "joint_vel": [0.0] * 7}
+    bad_robot = {name: change.get(name, value) for name, value in robot.items()}
+    bad_ball = {name: change.get(name, value) for name, value in ball.items()}
+    spoilt, clean = (Observer(ObservationConfig(critic="policy"), CHAIN) for _ in range(2))
+
+    with pytest.raises(ValueError, match=line):
+        spoilt.observe(**bad_robot, ball=BallSample(**bad_ball))
+    for observer in (spoilt, clean):
+        observer.begin((0.7, 0.2))
+    np.testing.assert_array_equal(
+        spoilt.observe(**robot, ball=BallSample(**ball)), clean.observe(**robot, ball=BallSample(**ball))
+    )
+
+
+@pytest.mark.parametrize(("column", "name"), [(3, r"joint_pos\[3\]"), (40, r"present_ball_pos\[0\]")])
+def test_a_policy_refuses_an_observation_that_is_not_finite_by_name(column, name):
+    policy, obs = load_policy(POLICIES / "default"), np.zeros((2, 54), np.float32)
+    obs[1, column] = np.nan
+
+    with pytest.raises(ValueError, match=rf"observation 1: {name} is nan; allowed: a finite number"):
+        policy.act(obs)
+
+
 def test_a_policy_that_observes_the_true_spin_is_refused():
     with pytest.raises(ValueError, match=r"spin 'true' can't be measured"):
         Observer(ObservationConfig(spin="true"), CHAIN)
