@@ -1,12 +1,14 @@
 """Which processes of a run hang.
 
 A process that works sends a heartbeat every second, or is busy: it imports, compiles, or trains a large dataset. A
-process that hangs is silent and uses no CPU time. The learner is the hub: while it is silent, nothing can be said about
+process that hangs is silent and uses no CPU time. One that waits for a core, because the machine has too much to do, is
+busy too. The learner is the hub: while it is silent, nothing can be said about
 the others.
 """
 
 import os
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -60,6 +62,15 @@ def cpu_seconds(process: int) -> float | None:
         return None
 
 
+def wants_a_core(process: int) -> bool:
+    """Return whether a thread of a process is running, or would be if a core were free; False if it can't be told."""
+    for stat in Path(f"/proc/{process}/task").glob("*/stat"):
+        with suppress(OSError):  # a thread that has just ended
+            if stat.read_text().rpartition(")")[2].split()[:1] == ["R"]:
+                return True
+    return False
+
+
 @dataclass(slots=True)
 class Watchdog:
     """Measures the CPU time of processes, and says which hang.
@@ -68,11 +79,13 @@ class Watchdog:
         hub: Name of the process that the others' heartbeats pass through.
         limit_s: Time without a sign of life; 0: off.
         cpu_of: Returns the CPU time of a process id.
+        wants_core: Returns whether it would run if it got a core.
     """
 
     hub: str
     limit_s: float
     cpu_of: Callable[[int], float | None] = cpu_seconds
+    wants_core: Callable[[int], bool] = wants_a_core
     _marks: dict[int, tuple[float, float]] = field(default_factory=dict)  # time and CPU time, by process id
     _busy: dict[int, float] = field(default_factory=dict)
     _looked: float | None = None  # time of the last look
@@ -104,6 +117,7 @@ class Watchdog:
         used = self.cpu_of(process)
         if used is None:
             return
-        if before is not None and used - before >= BUSY_SHARE * (now - since):
+        has_worked = before is not None and used - before >= BUSY_SHARE * (now - since)
+        if has_worked or self.wants_core(process):
             self._busy[process] = now
         self._marks[process] = (now, used)

@@ -304,7 +304,7 @@ class Command(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """A command to one service. The reply is a `ControlReply`."""
+    """A command to one service. The reply is a `ControlReply`; without TLS every command is refused."""
 
     VERSION: ClassVar[int] = 1
 

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from deploy.watchdog import LOOK_S, MOST_LIMITS, Pulse, Watchdog, cpu_seconds, hung, is_hung
+from deploy.watchdog import LOOK_S, MOST_LIMITS, Pulse, Watchdog, cpu_seconds, hung, is_hung, wants_a_core
 
 LIMIT = 60.0
 
@@ -46,7 +46,7 @@ def test_while_the_hub_is_silent_only_the_hub_is_judged():
 
 def test_after_a_stop_of_the_whole_run_nobody_hangs_until_the_limit_has_passed_again():
     """Ctrl-Z stops the watchdog too: when it goes on, all heartbeats are old."""
-    watchdog = Watchdog("learner-0", LIMIT, cpu_of=lambda _: 1.0)
+    watchdog = Watchdog("learner-0", LIMIT, cpu_of=lambda _: 1.0, wants_core=lambda _: False)
     processes = [("learner-0", 1, 0.0)]
     heard = {"learner-0": 10.0}
 
@@ -55,6 +55,17 @@ def test_after_a_stop_of_the_whole_run_nobody_hangs_until_the_limit_has_passed_a
     looks = [watchdog.look(processes, heard, stopped_until + second) for second in range(60)]
     assert looks == [[]] * 60
     assert watchdog.look(processes, heard, stopped_until + 61.0) == ["learner-0"]
+
+
+def test_a_process_that_waits_for_a_core_does_not_hang_however_little_it_gets():
+    """With too many processes on a machine one got no CPU time for a minute, and was killed again and again."""
+    starved = Watchdog("learner-0", LIMIT, cpu_of=lambda _: 1.0, wants_core=lambda _: True)
+    silent = Watchdog("learner-0", LIMIT, cpu_of=lambda _: 1.0, wants_core=lambda _: False)
+    processes, heard = [("learner-0", 1, 0.0)], {"learner-0": 10.0}
+    times = [10.0 + second for second in range(int(2 * LIMIT))]
+
+    assert [starved.look(processes, heard, now) for now in times] == [[]] * len(times)
+    assert [silent.look(processes, heard, now) for now in times][-1] == ["learner-0"]
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="needs /proc")
@@ -75,10 +86,12 @@ def test_a_stopped_process_is_told_from_a_busy_one():
         ):  # the watchdog's clock says 5.5 s
             time.sleep(0.05)
         found = watchdog.look(processes, heard, 6.0 + LOOK_S + 0.5)
+        wanting = wants_a_core(busy.pid), wants_a_core(stopped.pid)
     finally:
         for process in (busy, stopped):
             process.kill()
             process.wait()
 
     assert found == ["stopped"]
+    assert wanting == (True, False)
     assert cpu_seconds(2**30) is None
