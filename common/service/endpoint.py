@@ -24,9 +24,7 @@ from common.errors import ReportedError
 
 FIRST_PORT: Final = 9100  # of a machine's services: the next ones take the next ports
 PORTS_TRIED: Final = 1000  # as many as a run has actors
-HANGS_AFTER_S: Final = (
-    60.0  # far more than one turn of a main loop takes: an update, a rollout, a step of a match
-)
+HANGS_AFTER_S: Final = 60.0  # far more than one turn of a main loop takes, such as a rollout
 TEXT: Final = "text/plain; version=0.0.4; charset=utf-8"
 _CLIENT_S: Final = 10.0  # [s] a client that sends no request is cut off
 
