@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any, Final
 
-from common.service.metrics import METRICS
+from common.service.metric_table import METRICS
 
 RUN: Final = '{run="$run"}'
 COLUMNS: Final = 24  # of Grafana's grid

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from common.service import metrics
+from common.service import metric_table
 from common.task import observation_reference
 from deploy.manifests import alarms
 from topspin.reference import configuration, protocol, robots, sequences, state_diagram
@@ -16,7 +16,7 @@ def files() -> dict[str, str]:
     return {
         "observation.md": observation_reference.markdown(),
         "robots.md": robots.markdown(),
-        "metrics.md": metrics.markdown(),
+        "metrics.md": metric_table.markdown(),
         "alarms.md": alarms.markdown(),
         "protocol.md": protocol.markdown(),
         "configuration.md": configuration.markdown(),

@@ -10,7 +10,7 @@ import subprocess
 import pytest
 import yaml
 
-from common.service.metrics import METRICS, OWN_LABELS
+from common.service.metric_table import METRICS, OWN_LABELS
 from deploy.manifests.alarms import ALARMS, WAIT_SHARE, WAIT_SHARE_QUERY
 from deploy.manifests.files import FOLDER
 from deploy.manifests.panels import dashboard, expressions

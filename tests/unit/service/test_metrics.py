@@ -6,7 +6,8 @@ import urllib.request
 import pytest
 
 from common.service.endpoint import HANGS_AFTER_S, PORTS_TRIED, PortError
-from common.service.metrics import METRICS, OWN_LABELS, Metrics, MetricsError
+from common.service.metric_table import METRICS, OWN_LABELS
+from common.service.metrics import Metrics, MetricsError
 
 
 def test_names_have_the_suffixes_that_prometheus_expects():
