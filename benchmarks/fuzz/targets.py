@@ -16,8 +16,7 @@ from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import PolicyError, contract_of
 from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, load_policy, save_policy
 from common.service.config import ConfigError, read_toml, save_settings, to_tables
-from common.service.run_folder import whole_rows
-from common.service.table import Table
+from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from deploy.config import DeployConfig

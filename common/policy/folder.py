@@ -69,9 +69,9 @@ class Policy:
 def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
     """Write a policy, without its critic; a reader gets the old one or the new one, never a mixture.
 
-    The folder holds two plain files, and each is replaced in one step: first the weights, then the contract. The weights
-    carry a copy of the contract, and a digest of the contract file that it replaces. So `load_policy` finds the right
-    contract also where the writer is between the two files, or was killed there.
+    The folder holds two plain files, and each is replaced in one step: first the weights, then the contract. The
+    weights carry a copy of the contract, and a digest of the contract file that it replaces. So `load_policy` finds
+    the right contract also where the writer is between the two files, or was killed there.
     """
     _make_plain(folder)
     tensors: dict[str, npt.NDArray[Any]] = {
@@ -138,9 +138,7 @@ def load_policy(folder: Path) -> Policy:
     }
     try:
         moments = observation_moments(tensors[_OBS_MEAN], tensors[_OBS_VAR], tensors[_OBS_COUNT], layout)
-        load_state(
-            network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS}
-        )
+        load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
     except PolicyError as error:
         raise PolicyError(f"{weights_file}: {error}") from None
     return Policy(network, moments, contract)

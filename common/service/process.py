@@ -9,6 +9,7 @@
 """
 
 import errno
+import io
 import logging
 import math
 import os
@@ -59,6 +60,7 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
         prog: How the program is called; starts the line of an error.
         main: Runs the service and returns its status; raises errors that it can't handle.
     """
+    own_environment()
     stop = stop_on_signals()
     try:
         status = main(stop)
@@ -80,6 +82,13 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
         status = FAILED
     _exit_at_the_latest(status)
     return status
+
+
+def own_environment() -> None:
+    """Set what a person's environment sets for other programs, and what would stop or change ours."""
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a notebook's own can't be loaded here
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # an encoding without our signs
 
 
 def stop_on_signals() -> threading.Event:

@@ -5,8 +5,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from common.service import table
 from common.service.table import Table
-from common.service.whole_file import write_whole
 from common.task.reward import TERMS
 from common.task.states import Outcome
 from services.learner.epoch_stats import EpochStats
@@ -84,16 +84,19 @@ class RunLog:
             self._events = None  # its thread has ended: the next epoch begins another file
             log.error("can't write folder=%s reason=%s", self._tensorboard, error.strerror)
 
-    def truncate(self, epoch: int) -> None:
-        """Drop rows after ``epoch``: epochs that a resumed run trains again."""
-        if not self._path.exists():
-            return
-        with self._path.open(newline="") as file:
-            lines = file.readlines()
-        # a learner that was killed may have left an incomplete line at the end
-        rows = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",", 1)[0]) <= epoch]
-        kept = lines[:1] + rows
-        write_whole(self._path, "".join(kept))
+    def truncate(self, epoch: int, frames: int) -> None:
+        """Drop rows after ``epoch``, and TensorBoard's events after ``frames``: what a resumed run trains again."""
+        found = table.read(self._path)
+        if found.columns:
+            # a learner that was killed may have left an incomplete line at the end
+            kept = [row for row in found.rows if row.get("epoch") and float(row["epoch"]) <= epoch]
+            table.set_aside(self._path, found.refused)
+            table.rewrite(self._path, found.columns, kept)
+        for file in sorted(self._tensorboard.glob("events.*"), reverse=True):
+            from services.learner.event_files import cut_after  # noqa: PLC0415
+
+            if not cut_after(file, frames):
+                break
 
     def close(self) -> None:
         """Write TensorBoard's buffer."""

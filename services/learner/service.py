@@ -121,7 +121,7 @@ class LearnerService:
         # After the checkpoint has proved that they fit
         save_settings(self._folder.config, to_tables(config, "learner"))
         if not config.resume:
-            self._run_log.truncate(0)  # rows of a process that ended before its first checkpoint
+            self._run_log.truncate(0, -1)  # rows of a process that ended before its first checkpoint
         self._intake = self._new_intake(extras)
         self._alive: set[tuple[str, str, int]] = set()
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
@@ -352,7 +352,8 @@ class LearnerService:
         """Load the newest whole checkpoint; return what the service keeps in it."""
         file, extras = checkpoint.restore_newest(self._folder.checkpoints, self.training)
         self._clocks.resumed_seconds = extras.trained_seconds
-        self._run_log.truncate(self.training.progress.epoch)
+        progress = self.training.progress
+        self._run_log.truncate(progress.epoch, progress.frames)
         log.info(
             "resumed file=%s epoch=%d frames=%d waiting=%d",
             file,

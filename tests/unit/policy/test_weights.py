@@ -181,8 +181,14 @@ def test_weights_travel_as_bytes_and_arrive_unchanged():
         (lambda folder: edit(folder, "frames", -1), "contract.json: frames: .*greater than .* got -1"),
         (lambda folder: recoded(folder, "utf-16"), "contract.json is not text in UTF-8: .* at byte 0"),
         (lambda folder: tensor(folder, "obs_moments.var", 3, -1.0), r"obs_moments.var\[3\] is -1.0; allowed"),
-        (lambda folder: tensor(folder, "obs_moments.var", 0, np.inf), r"obs_moments.var\[0\] is inf; allowed"),
-        (lambda folder: tensor(folder, "obs_moments.var", 0, np.nan), r"obs_moments.var\[0\] is nan; allowed"),
+        (
+            lambda folder: tensor(folder, "obs_moments.var", 0, np.inf),
+            r"obs_moments.var\[0\] is inf; allowed",
+        ),
+        (
+            lambda folder: tensor(folder, "obs_moments.var", 0, np.nan),
+            r"obs_moments.var\[0\] is nan; allowed",
+        ),
         (
             lambda folder: tensor(folder, "obs_moments.mean", 1, np.nan),
             r"weights.safetensors: obs_moments.mean\[1\] is nan; allowed are finite numbers",
@@ -193,7 +199,10 @@ def test_weights_travel_as_bytes_and_arrive_unchanged():
         ),
         (lambda folder: tensor(folder, "obs_moments.count", ..., 0), r"obs_moments.count is 0; allowed"),
         (lambda folder: tensor(folder, "obs_moments.count", ..., 1.5), r"obs_moments.count is 1.5; allowed"),
-        (lambda folder: tensor(folder, "mean.bias", 0, np.nan), r"safetensors: weights 'mean.bias' are not fin"),
+        (
+            lambda folder: tensor(folder, "mean.bias", 0, np.nan),
+            r"safetensors: weights 'mean.bias' are not fin",
+        ),
         (lambda folder: tensor(folder, "mean.bias", ..., np.arange(7)), r"'mean.bias' are int64; allowed"),
         (lambda folder: tensor(folder, "mean.bias", ..., np.full(7, 1e300)), r"'mean.bias' are not finite"),
     ],
