@@ -96,8 +96,8 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         task, teacher = config.task, config.experience.teacher
-        # Raises here if the teacher does not fit: otherwise actors would end because of it and be restarted for ever
-        teacher_of(task, teacher)
+        if not config.resume:
+            teacher_of(task, teacher)  # before a folder is made
         self._folder.create()
         self._run_log = RunLog(self._folder.metrics, self._folder.tensorboard)
         self._intake_config = config.intake.for_actors(config.actors)
@@ -116,6 +116,9 @@ class LearnerService:
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
         extras = self._restore() if config.resume else None
+        if self.training.is_distilling:
+            # Raises here if the teacher does not fit: otherwise actors would end because of it, for ever restarted
+            teacher_of(task, teacher)
         stages = tuple(StageChange(**change) for change in extras.stage_log) if extras else ()
         self._generation = next_generation(self._folder.generation, extras.generation if extras else 0)
         # After the checkpoint has proved that they fit
