@@ -7,7 +7,6 @@ cache where the sources belong to someone else. A damaged file of the cache is t
 that can't be written costs a compilation at each start: both are one line in the log.
 """
 
-import functools
 import hashlib
 import logging
 import os
@@ -76,7 +75,7 @@ class _DamagedError(Exception):
     """A file of the cache does not hold what was written."""
 
 
-class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]  # numba has no types
+class _CheckedFiles(IndexDataCacheFile):
     """numba's files, with a checksum: damaged machine code would end the process without a word."""
 
     def _save_data(self, name: str, data: Any) -> None:
@@ -91,7 +90,7 @@ class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]  # numba has no t
         return pickle.loads(content[4:])
 
 
-class _KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no types
+class _KernelCache(FunctionCache):
     """numba's cache of one kernel; its files may be damaged or unwritable, and the kernel is compiled then."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -107,13 +106,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no types
         try:
             return super().load_overload(sig, target_context)
         except Exception as error:  # whatever damaged content makes pickle raise
-            log.warning(
-                "a damaged file of the kernel cache is thrown away and made again kernel=%s folder=%s reason=%s: %s",
-                self._py_func.__qualname__,
-                self._cache_path,
-                type(error).__name__,
-                error,
-            )
+            _say_once("damaged files of the kernel cache are thrown away and made again", error)
             self._throw_away()
             return None
 
@@ -121,8 +114,8 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no types
         """Keep a compiled kernel, where that is possible."""
         try:
             super().save_overload(sig, data)
-        except OSError as error:
-            _warn_once(str(self._cache_path), error.strerror or str(error))
+        except Exception as error:  # a full disk, or an index that was damaged meanwhile
+            _say_once(_NOT_KEPT, error)
 
     def _throw_away(self) -> None:
         """Remove the index: the files that it names are written again."""
@@ -130,12 +123,19 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]  # numba has no types
         try:
             shutil.rmtree(index) if index.is_dir() else index.unlink(missing_ok=True)
         except OSError as error:
-            _warn_once(str(self._cache_path), error.strerror or str(error))
+            _say_once(_NOT_KEPT, error)
 
 
-@functools.cache
-def _warn_once(folder: str, reason: str) -> None:
-    log.warning("compiled kernels can't be kept, every start compiles folder=%s reason=%s", folder, reason)
+_NOT_KEPT: Final = "compiled kernels can't be kept, so every start compiles"
+_said: set[tuple[str, str]] = set()
+
+
+def _say_once(what: str, error: Exception) -> None:
+    """Log what is wrong with the cache: one line, however many kernels there are."""
+    folder: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    if (folder, what) not in _said:
+        _said.add((folder, what))
+        log.warning("%s folder=%s reason=%s: %s", what, folder, type(error).__name__, error)
 
 
 def _folder_of_kernels() -> Path | None:

@@ -39,9 +39,21 @@ STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ReportedError: FAILED,
 }
 
-# Faults of the machine and not of the program, also where the error names no file.
+# Faults of the machine or of what a person made of it, and not of the program, also where the error names no file.
 MACHINE_FAULTS: Final = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE}
+    {
+        *(
+            errno.ENOSPC,
+            errno.EDQUOT,
+            errno.EFBIG,
+            errno.EROFS,
+            errno.EIO,
+            errno.ESTALE,
+            errno.EACCES,
+            errno.EPERM,
+        ),
+        *(errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.EPIPE),
+    }
 )
 
 SECOND_SIGNAL_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 15.0}
@@ -75,7 +87,10 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
             log.exception("stopped by a bug")
         else:
             where = f"{error.filename}: " if error.filename is not None else ""
-            sys.stderr.write(f"{prog}: {where}{error.strerror}\n")
+            sys.stderr.write(f"{prog}: {where}{error.strerror or error}\n")
+        status = FAILED
+    except MemoryError as error:
+        sys.stderr.write(f"{prog}: {str(error) or os.strerror(errno.ENOMEM)}\n")
         status = FAILED
     except Exception:
         log.exception("stopped by a bug")

@@ -254,9 +254,12 @@ class LearnerService:
             self._save(is_last)
         except OSError as error:
             self._metrics.inc("topspin_failed_saves_total")
-            text = f"epoch {self.training.progress.epoch} can't be saved in {self._folder.root}: {error.strerror}"
+            where = error.filename or self._folder.root
+            text = f"epoch {self.training.progress.epoch} can't be saved in {where}: {error.strerror}"
             if is_last:
-                raise NotSavedError(f"{text}; what an earlier checkpoint holds is kept") from None
+                older = checkpoint.checkpoints(self._folder.checkpoints)
+                kept = f"the newest checkpoint is {older[-1]}" if older else "there is no checkpoint"
+                raise NotSavedError(f"{text}; {kept}") from None
             log.error("%s; training goes on, next try in %.0f s", text, self._config.checkpoint_interval_s)
 
     def _save(self, is_last: bool) -> None:

@@ -114,10 +114,7 @@ def test_a_damaged_file_of_the_cache_is_thrown_away_and_made_again(tmp_path, cac
 
     assert again(1.5) == 3.0
     assert len(caplog.records) <= 1
-    assert all(
-        re.search("is thrown away and made again kernel=twice|can't be kept", line)
-        for line in caplog.messages
-    )
+    assert all(re.search("are thrown away and made again|can't be kept", line) for line in caplog.messages)
     assert was_kept(again) or file.is_dir()
 
 
@@ -128,7 +125,7 @@ def test_where_the_disk_is_full_kernels_run_and_one_line_says_that_they_are_not_
         assert found(2) == 4.0
 
     assert [message.split(" folder=")[0] for message in caplog.messages] == [
-        "compiled kernels can't be kept, every start compiles"
+        "compiled kernels can't be kept, so every start compiles"
     ]
 
 
