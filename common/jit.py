@@ -138,14 +138,34 @@ def _say_once(what: str, error: Exception) -> None:
         log.warning("%s folder=%s reason=%s: %s", what, folder, type(error).__name__, error)
 
 
+def seed_cache(folder: Path, prebuilt: Path) -> None:
+    """Copy the kernels that came with a read-only install into the user's ``folder``, unless it exists."""
+    if folder.exists() or not prebuilt.is_dir():
+        return
+    part = folder.with_name(f".{folder.name}-{os.getpid()}")
+    try:
+        shutil.copytree(prebuilt, part, copy_function=shutil.copyfile)
+        part.rename(folder)
+    except OSError as error:  # another process was first, or the disk is full: what is missing is compiled
+        log.info("kernels not copied from=%s to=%s reason=%s", prebuilt, folder, error)
+    shutil.rmtree(part, ignore_errors=True)
+
+
 def _folder_of_kernels() -> Path | None:
-    own = os.environ.get("NUMBA_CACHE_DIR")
-    return writable_cache([*([Path(own)] if own else []), _ROOT / ".numba_cache", *user_cache()])
+    """Return this release's folder of kernels; None where they can't be kept."""
+    own, installed = os.environ.get("NUMBA_CACHE_DIR"), _ROOT / ".numba_cache"
+    folder = writable_cache([*([Path(own)] if own else []), installed, *user_cache()])
+    if folder is None:
+        return None
+    digest = _source_digest()
+    if folder != installed:
+        seed_cache(folder / digest, installed / digest)
+    return folder / digest
 
 
 _folder = _folder_of_kernels()
 # numba makes its settings attributes when it is imported
-numba.config.CACHE_DIR = str(_folder / _source_digest()) if _folder else ""  # type: ignore[attr-defined]
+numba.config.CACHE_DIR = str(_folder or "")  # type: ignore[attr-defined]
 
 
 def _compiled(function: _Kernel, **options: Any) -> _Kernel:

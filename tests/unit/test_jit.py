@@ -8,7 +8,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from common.jit import KERNEL_ROOMS, user_cache, writable_cache
+from common.jit import KERNEL_ROOMS, seed_cache, user_cache, writable_cache
 from tests.full_disk import files_up_to
 
 ROOT = Path(__file__).parents[2]
@@ -127,6 +127,21 @@ def test_where_the_disk_is_full_kernels_run_and_one_line_says_that_they_are_not_
     assert [message.split(" folder=")[0] for message in caplog.messages] == [
         "compiled kernels can't be kept, so every start compiles"
     ]
+
+
+def test_kernels_that_came_with_a_read_only_install_are_copied_once(tmp_path):
+    (tmp_path / "installed" / "module_1").mkdir(parents=True)
+    (tmp_path / "installed" / "module_1" / "k.nbi").write_text("kernel")
+    (tmp_path / "installed" / "module_1" / "k.nbi").chmod(0o444)
+    mine = tmp_path / "mine" / "digest"
+    mine.parent.mkdir()
+    seed_cache(mine, tmp_path / "installed")
+    (mine / "module_1" / "k.nbi").write_text("newer")
+    seed_cache(mine, tmp_path / "installed")
+    seed_cache(tmp_path / "mine" / "other", tmp_path / "missing")
+
+    assert (mine / "module_1" / "k.nbi").read_text() == "newer"
+    assert [path.name for path in mine.parent.iterdir()] == ["digest"]
 
 
 def test_a_home_that_is_no_folder_of_ones_own_is_not_used(monkeypatch):
