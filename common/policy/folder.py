@@ -115,7 +115,7 @@ def load_policy(folder: Path) -> Policy:
     except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a dtype that numpy lacks
         raise PolicyError(f"{weights_file} is not readable as safetensors: {error}") from None
     if carried.get(_REPLACED) == _digest(text):  # the writer has not replaced the contract yet
-        text = carried[_OWN_CONTRACT].encode()
+        text = carried.get(_OWN_CONTRACT, "").encode()
     contract = _judged(text, contract_file)
     options = contract.task.observation
     layout = policy_layout(options)

@@ -317,14 +317,14 @@ def _read_environment(environ: Mapping[str, str], program: _Program) -> _Layer:
 def _check_use(file: str, program: _Program) -> None:
     """Raise ConfigError if a file that was given to this program has a table of another, or nothing for this one."""
     content = read_toml(Path(file))
-    settings = program.settings
-    own = {path.split(".")[0] for path in settings if "." in path} & set(TABLES) | {program.section}
-    allowed = own | (set(RUN_TABLES) if own & set(RUN_TABLES) else set())
+    own = {path.split(".")[0] for path in program.settings if "." in path} & set(TABLES) | {program.section}
     reads = f"{program.prog} reads {', '.join(f'[{table}]' for table in TABLES if table in own)}"
+    allowed = own | (set(RUN_TABLES) if own & set(RUN_TABLES) else set())
     for table in content:
         if table in TABLES and table not in allowed:
             raise ConfigError(f"[{table}] in {file} is not used: {reads}")
-    if content and not content.keys() & (own | settings.keys() | (content.keys() - {*TABLES, *SHARED})):
+    known = content.keys() & {*TABLES, *SHARED}  # _read_file names the others
+    if known == content.keys() != set() and not known & (own | program.settings.keys()):
         raise ConfigError(f"nothing in {file} is used: {reads}; got {', '.join(sorted(content))}")
 
 

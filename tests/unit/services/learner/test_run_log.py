@@ -2,10 +2,11 @@
 
 import logging
 
+import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from common.service.table import whole_rows
-from services.learner.run_log import RunLog
+from services.learner.run_log import RunLog, RunLogError
 
 
 def logged(folder, epochs, **more):
@@ -29,6 +30,7 @@ def in_tensorboard(folder):
 def test_after_a_resume_that_rolled_back_both_records_tell_the_same(tmp_path):
     logged(tmp_path, range(1, 4))
     logged(tmp_path, range(4, 9))
+    (tmp_path / "tb" / "events.out.tfevents.9999999999.of_a_process_that_was_killed_at_once").touch()
     RunLog(tmp_path / "metrics.csv", tmp_path / "tb").truncate(3, 300)
     cut = in_tensorboard(tmp_path)
     logged(tmp_path, [4, 5])
@@ -71,3 +73,11 @@ def test_a_resume_goes_on_with_the_columns_of_an_earlier_release(tmp_path):
         {"epoch": "1", "frames": "100", "kl": "", "loss": "0.5"},
         {"epoch": "2", "frames": "200", "kl": "0.02", "loss": ""},
     ]
+
+
+def test_a_file_that_is_no_table_of_epochs_is_refused_and_stays(tmp_path):
+    (tmp_path / "metrics.csv").write_text("name\tvalue\n1\t2\n")
+
+    with pytest.raises(RunLogError, match=r"metrics.csv:1: no column epoch; got name\tvalue"):
+        RunLog(tmp_path / "metrics.csv", tmp_path / "tb").truncate(3, 300)
+    assert (tmp_path / "metrics.csv").read_text() == "name\tvalue\n1\t2\n"
