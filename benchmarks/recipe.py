@@ -20,7 +20,8 @@ from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
 from common.service.config import load, read_toml, recipe_names, to_tables
 from common.service.process import DONE
-from common.service.run_folder import RunFolder, whole_rows
+from common.service.run_folder import RunFolder
+from common.service.table import whole_rows
 from deploy.config import RECIPES, DeployConfig
 from deploy.prepare import SECTION
 from topspin.report.collect import find

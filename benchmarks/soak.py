@@ -30,7 +30,7 @@ from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from common.service.log import set_up_logging
 from common.service.process import DONE
-from common.service.run_folder import whole_rows
+from common.service.table import whole_rows
 from deploy.config import DeployConfig
 from deploy.prepare import PreparedRun, open_link, prepared
 from deploy.supervisor import Supervisor

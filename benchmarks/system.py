@@ -22,7 +22,8 @@ from common.comms.messages import Status
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from common.service.process import DONE
-from common.service.run_folder import LATEST, RUNS, whole_rows
+from common.service.run_folder import LATEST, RUNS
+from common.service.table import whole_rows
 from deploy.config import DeployConfig
 from deploy.prepare import PreparedRun, open_link, prepared
 from deploy.supervisor import Supervisor

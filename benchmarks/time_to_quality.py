@@ -23,7 +23,8 @@ from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
-from common.service.run_folder import RunFolder, whole_rows
+from common.service.run_folder import RunFolder
+from common.service.table import whole_rows
 
 RETURN_RATE, TARGET_ERROR = 0.81, 0.31  # [share], [m] the paper's table
 LOOK_S = 1.0

@@ -53,7 +53,7 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
         "are free; 0: any free ports",
     )
     panel: Literal["auto", "on", "off"] = Field(
-        "auto", description="live terminal panel; auto: if there is a terminal"
+        "auto", description="live terminal panel, in place of lines of progress; auto: if there is a terminal"
     )
     watchdog_s: float = Field(
         60.0,

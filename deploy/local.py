@@ -98,13 +98,21 @@ def final_measures(run: PreparedRun, stop: Event) -> dict[str, Any]:
     return measured
 
 
+def shows_panel(wanted: str, console: Console) -> bool:
+    """Return whether the panel can be shown, and is wanted; lines of progress are logged where it is not."""
+    if console.is_dumb_terminal:  # it can't move its cursor
+        return False
+    # The person's environment may call a file a terminal, or a terminal a file
+    is_terminal = console.file.isatty() and console.is_terminal and console.is_interactive
+    return wanted == "on" or (wanted == "auto" and is_terminal)
+
+
 def watch(
     run: PreparedRun, view: View, transport: Transport, watcher: Watcher, supervisor: Supervisor, stop: Event
 ) -> None:
     """Keep the processes alive and show their state, until the learner ends or ``stop`` is set."""
-    panel = run.config.panel
     console = Console(stderr=True)
-    has_panel = panel == "on" or (panel == "auto" and console.is_terminal)
+    has_panel = shows_panel(run.config.panel, console)
     log_file = run.folder.logs / LOG_FILE
     with ExitStack() as stack:
         live = stack.enter_context(Live(console=console, auto_refresh=False)) if has_panel else None

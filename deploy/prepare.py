@@ -1,13 +1,12 @@
 """Preparing a run: its settings, its folder, its ports, and the processes that it needs."""
 
 import errno
-import os
+import itertools
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import islice
 from threading import Event
 from typing import Final
 
@@ -22,7 +21,8 @@ from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
 from common.service.endpoint import PORTS_TRIED
-from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, whole_rows
+from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, newest_run
+from common.service.table import whole_rows
 from deploy.config import CONNECT_S, RECIPES, DeployConfig
 from deploy.supervisor import Spec
 from deploy.topology import ROLES, Role
@@ -86,7 +86,7 @@ class PreparedRun:
 def last_epoch(folder: RunFolder) -> dict[str, str]:
     """Return the last row of a run's metrics.csv; {} before anything is trained."""
     rows = whole_rows(folder.metrics)
-    return rows[-1] if rows else {}
+    return rows[-1] if rows and {"epoch", "frames", "seconds"} <= rows[-1].keys() else {}
 
 
 def metrics_ports(config: DeployConfig) -> list[int]:
@@ -101,7 +101,7 @@ def metrics_ports(config: DeployConfig) -> list[int]:
     if not config.metrics_port:
         return [0] * count
     ports = range(config.metrics_port, min(config.metrics_port + count + PORTS_TRIED, 65536))
-    free = list(islice((port for port in ports if is_free(config.metrics_host, port)), count))
+    free = list(itertools.islice((port for port in ports if is_free(config.metrics_host, port)), count))
     if len(free) < count:
         raise ConfigError(
             f"metrics_port {config.metrics_port}: {len(free)} ports from there to {ports[-1]} are free; "
@@ -147,9 +147,9 @@ def settings(argv: Sequence[str], prog: str) -> DeployConfig:
             raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
         return load(DeployConfig, argv, prog=prog, section=SECTION, recipes=RECIPES)
     if not asked.run:
-        newest = f": the newest run is {os.readlink(RUNS / LATEST)}" if (RUNS / LATEST).is_symlink() else ""
+        newest = f": the newest run is {found}" if (found := newest_run()) else ""
         raise ConfigError(f"--resume needs --run NAME{newest}")
-    name = os.readlink(RUNS / LATEST) if asked.run == LATEST else asked.run
+    name = (newest_run() or LATEST) if asked.run == LATEST else asked.run
     file = RunFolder.of(name).config
     if not file.exists():
         raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
@@ -176,20 +176,14 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
 
     A resumed run whose new settings don't fit, and which fails before it has trained anything, keeps its old ones.
     """
-    name = config.run or datetime.now().strftime("%Y%m%d-%H%M%S")
-    Keys(name)  # refuses a name that can't be part of a key; any other name can be a folder's
-    folder = RunFolder.of(name)
-    # Before the other checks: a live run would fail them too, but this error says more.
-    for holder in LOCKS:
-        folder.check_free_of(holder)
-    if folder.config.exists() and not config.resume:
-        raise ConfigError(
-            f"run {name!r} exists already in {folder.root}: go on with --resume, or choose another --run"
-        )
+    if config.run:
+        check_name(config)  # first: a live run would fail the other checks too, but this error says more
     metrics_ports(config)  # raises before anything is written
     # A new endpoint each time unless one is set: the old one may be taken.
     link = link_to_learner(config, config.endpoint or free_endpoint("tls" if config.tls else "tcp"))
     check_certificates(config)
+    name = config.run or new_name(datetime.now().strftime("%Y%m%d-%H%M%S"))
+    folder = RunFolder.of(name)
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
         before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
@@ -200,6 +194,31 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
             if before and last_epoch(folder) == trained:
                 save_settings(folder.config, before)
             raise
+
+
+def check_name(config: DeployConfig) -> None:
+    """Raise an error if the run's name can't be used, or if the run exists or is alive."""
+    Keys(config.run)  # refuses a name that can't be part of a key; any other name can be a folder's
+    folder = RunFolder.of(config.run)
+    for holder in LOCKS:
+        folder.check_free_of(holder)
+    if folder.config.exists() and not config.resume:
+        raise ConfigError(
+            f"run {config.run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
+        )
+
+
+def new_name(stem: str) -> str:
+    """Return the name of a new run whose folder is now made: ``stem``, or ``stem-2`` and so on where it is taken."""
+    RUNS.mkdir(parents=True, exist_ok=True)
+    for number in itertools.count(1):
+        name = stem if number == 1 else f"{stem}-{number}"
+        try:
+            (RUNS / name).mkdir()  # the first of several processes gets it
+        except FileExistsError:
+            continue
+        return name
+    raise AssertionError("unreachable")
 
 
 def write(config: DeployConfig, name: str, folder: RunFolder, endpoint: str) -> None:

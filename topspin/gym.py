@@ -13,14 +13,16 @@ Observations are the policy's: the simulator's truth, which only our critic obse
 say. Every rally is an episode that is played to its end, unless ``end_at_hit_share`` or ``continue_share`` is given.
 """
 
-from collections.abc import Mapping
-from typing import Any, Final
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NoReturn, TypeVar
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
+from pydantic import BaseModel, ValidationError
 
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import FinishedRallies, RallyEnv
@@ -31,6 +33,7 @@ from common.task.observation import ACTION, PAPER_OBSERVATION, Part, policy_layo
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
 
+_Model = TypeVar("_Model", bound=BaseModel)
 _EPISODES: Final = ("end_at_hit_share", "continue_share")
 
 
@@ -51,6 +54,30 @@ DEFAULTS: Final[Mapping[str, Any]] = {
 """Where this environment differs from the one that our actors play."""
 
 
+def _of_settings(model: type[_Model], given: dict[str, Any]) -> _Model:
+    """Return settings; raises ValueError with one line: the name, the value, and what is allowed."""
+    try:
+        return model(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = (*TaskConfig.model_fields, *_EPISODES)
+            nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            hint = f"did you mean {nearest[0]!r}?" if nearest else f"allowed: {', '.join(known)}"
+            raise ValueError(f"unknown setting {name!r}; {hint}") from None
+        raise ValueError(f"{name or 'settings'} = {first['input']!r}; {first['msg']}") from None
+
+
+def _check_choices(render_mode: str | None, stage: int, count: int) -> None:
+    if render_mode is not None:
+        raise ValueError(f"render_mode {render_mode!r}; allowed: None (films: topspin play --video FILE)")
+    if stage not in (1, 2, 3):
+        raise ValueError(f"stage {stage!r}; allowed: 1, 2, 3")
+    if count < 1:
+        raise ValueError(f"num_envs {count!r}; allowed: a whole number from 1")
+
+
 class _RallyBatch:
     """A batch of environments with rallies of its own."""
 
@@ -58,8 +85,8 @@ class _RallyBatch:
         self._count, self._stage = count, stage
         given = {**DEFAULTS, **settings}
         episodes = {name: given.pop(name) for name in _EPISODES}
-        self._experience = ExperienceConfig(hit_correction=False, **episodes)
-        task = TaskConfig(**given)
+        self._experience = _of_settings(ExperienceConfig, {"hit_correction": False, **episodes})
+        task = _of_settings(TaskConfig, given)
         observation = task.observation.model_copy(update={"critic": "policy"})
         self._task = task.model_copy(update={"observation": observation})
         self.observation_space = _box(policy_layout(observation))
@@ -70,6 +97,12 @@ class _RallyBatch:
         source = LocalRallies(seed, self._task)
         self.env = RallyEnv(self._count, self._task, source, self._stage, experience=self._experience)
         return self.env.reset()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
+        """Refuse: the simulator's state is not Python's."""
+        raise TypeError(
+            "an environment can't be copied; make another with the same settings, and reset it with the same seed"
+        )
 
     @property
     def started(self) -> RallyEnv:
@@ -83,6 +116,10 @@ def _within(obs: Floats, space: spaces.Box) -> Floats:
     """Return observations clipped to their stated ranges: a blow can throw a ball beyond them."""
     clipped: Floats = np.clip(obs, space.low, space.high)
     return clipped
+
+
+def _warn_of_rendering() -> None:
+    gymnasium.logger.warn("render() without a render_mode returns None; films: topspin play --video FILE")
 
 
 def _fresh_seed(random: np.random.Generator) -> int:
@@ -112,6 +149,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
     metadata = {"render_modes": [], "render_fps": 50}  # noqa: RUF012  # Gymnasium's own name and form
 
     def __init__(self, stage: int = 3, render_mode: str | None = None, **settings: Any) -> None:
+        _check_choices(render_mode, stage, 1)
         self.render_mode = render_mode
         self._batch = _RallyBatch(1, stage, settings)
         self.observation_space, self.action_space = self._batch.observation_space, ACTION_SPACE
@@ -130,6 +168,10 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
             obs = self._next_obs
         self._next_obs = None
         return _within(obs[0], self._batch.observation_space), {}
+
+    def render(self) -> None:
+        """Warn: there is no picture."""
+        _warn_of_rendering()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Play one control step."""
@@ -172,6 +214,10 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
+        _check_choices(render_mode, stage, num_envs)
+        mode = settings.pop("autoreset_mode", AutoresetMode.SAME_STEP)
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(f"autoreset_mode {mode}; allowed: {AutoresetMode.SAME_STEP}")
         self.num_envs = num_envs
         self._batch = _RallyBatch(num_envs, stage, settings)
         self.single_observation_space, self.single_action_space = self._batch.observation_space, ACTION_SPACE
@@ -180,13 +226,55 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         self.render_mode = render_mode
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Floats, dict[str, Any]]:
-        """Begin all episodes. One seed decides them all."""
-        super().reset(seed=seed)
-        if seed is not None or self._batch.env is None:
-            return _within(self._batch.begin(_fresh_seed(self.np_random)), self._batch.observation_space), {}
-        return _within(self._batch.env.reset(), self._batch.observation_space), {}
+        """Begin episodes.
+
+        Args:
+            seed: Decides all episodes from here on; a list of one for each environment is one seed, together.
+            options: ``reset_mask`` (B,) bool: which environments begin a new episode; the others go on.
+        """
+        one = None if seed is None else self._one_seed(seed)
+        mask = (options or {}).get("reset_mask")
+        rows = None if mask is None else self._rows_of(mask, one)
+        super().reset(seed=one)
+        if one is not None or self._batch.env is None:
+            obs = self._batch.begin(_fresh_seed(self.np_random))
+        else:
+            obs = self._batch.env.reset(rows)
+        return _within(obs, self._batch.observation_space), {}
+
+    def render(self) -> None:
+        """Warn: there is no picture."""
+        _warn_of_rendering()
+
+    def _one_seed(self, seed: int | Sequence[int]) -> int:
+        """Return one seed for a seed, or for one of each environment."""
+        if isinstance(seed, int | np.integer):
+            return int(seed)
+        seeds = list(seed)
+        if len(seeds) != self.num_envs or not all(isinstance(s, int | np.integer) and s >= 0 for s in seeds):
+            raise ValueError(f"seed {seed!r}; allowed: a whole number from 0, or {self.num_envs} of them")
+        return int(np.random.SeedSequence(seeds).generate_state(1)[0])
+
+    def _rows_of(self, mask: Any, seed: int | None) -> npt.NDArray[np.intp]:
+        """Return the rows of a reset mask."""
+        given = np.asarray(mask)
+        if given.shape != (self.num_envs,) or given.dtype != np.bool_ or not given.any():
+            raise ValueError(
+                f"reset_mask of shape {given.shape} and {given.dtype}, {np.count_nonzero(given)} set; "
+                f"allowed: ({self.num_envs},) bool, at least one set"
+            )
+        if seed is not None and not given.all():
+            raise ValueError(
+                "seed with a reset_mask; allowed: one of them, since a seed decides all episodes"
+            )
+        if self._batch.env is None and not given.all():
+            raise gymnasium.error.ResetNeeded("reset_mask before reset(): reset all environments first")
+        return np.flatnonzero(given)
 
     def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
         """Play one control step with every robot."""

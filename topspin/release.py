@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from common.evaluation.evaluate import check, measure
 from common.evaluation.match import DEFAULT_ENVS, Environments, MatchConfig, MatchSpin
 from common.policy.box import BOX, policy_folder
-from common.policy.folder import load_policy, mean_policy, write_policy
+from common.policy.folder import load_policy, mean_policy, save_policy
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
@@ -82,6 +82,6 @@ def main(argv: Sequence[str], stop: Event) -> int:
         made_with["trained_with_expected_spin"] = policy.contract.task.observation.expected_spin
     contract = contract.model_copy(update={"measures": found, "made_with": made_with})
     target = Path(config.box) / config.name
-    write_policy(target, policy.network, policy.moments, contract)
+    save_policy(target, policy.network, policy.moments, contract)
     sys.stdout.write(json.dumps({"policy": str(target), "measures": found}) + "\n")
     return DONE

@@ -14,10 +14,9 @@ from common.comms.codec import DecodeError, decode, encode
 from common.comms.messages import MESSAGES
 from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import PolicyError, contract_of
-from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, load_policy, write_policy
+from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, load_policy, save_policy
 from common.service.config import ConfigError, read_toml, save_settings, to_tables
-from common.service.run_folder import whole_rows
-from common.service.table import Table
+from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from deploy.config import DeployConfig
@@ -101,7 +100,7 @@ def _policy() -> tuple[Target, Target]:
         TaskConfig(), ExperienceConfig(), SMALL, run="r", generation=1, version=1, stage=1, frames=1
     )
     folder = _folder() / "policy"
-    write_policy(folder, training.network, training.obs_moments, contract)
+    save_policy(folder, training.network, training.obs_moments, contract)
     files = {name: (folder / name).read_bytes() for name in (WEIGHTS_FILE, CONTRACT_FILE)}
 
     def reader(name: str) -> Callable[[bytes], object]:

@@ -216,15 +216,22 @@ class RallyEnv:
         """The robots' motion in the last control step."""
         return self._contacts.motion
 
-    def reset(self) -> Floats:
-        """Start every environment again, robots at home and opponents unknown, and return the observations (B, D)."""
+    def reset(self, rows: Rows | None = None) -> Floats:
+        """Start environments again, robots at home and opponents unknown; return all observations (B, D).
+
+        Args:
+            rows: Which; the others go on. None: all of them.
+        """
+        if rows is None or not self._started:
+            rows = self._all
         self._started = False
-        self._rallies.track[:] = self._new_tracks()
-        self.robot.go_home(self._all, np.zeros((self.count, ACTION_SIZE)))
-        self._rallies.last_action[:] = self.robot.home_action
-        self._begin(self._all, np.zeros(self.count, np.bool_))
+        if len(self._rallies.track):
+            self._rallies.track[rows] = self._new_tracks()[rows]
+        self.robot.go_home(rows, np.zeros((rows.size, ACTION_SIZE)))
+        self._rallies.last_action[rows] = self.robot.home_action
+        self._begin(rows, np.zeros(rows.size, np.bool_))
         self._started = True
-        self._observe(self._all)
+        self._observe(rows)
         return self._obs.copy()
 
     def step(self, actions: npt.ArrayLike) -> EnvStep:

@@ -5,6 +5,7 @@ from typing import Final
 
 from common.policy.contract import PolicyError
 from common.policy.folder import CONTRACT_FILE
+from common.service.run_folder import LATEST, RUNS, RunFolder
 
 BOX: Final = Path(__file__).resolve().parents[2] / "assets" / "policies"
 
@@ -25,6 +26,8 @@ def policy_folder(given: str) -> Path:
     if given in names():
         return BOX / given
     folder = Path(given)
+    if folder.parts[:2] == (RUNS.name, LATEST):  # the link may be missing
+        folder = RunFolder.of(LATEST).root.joinpath(*folder.parts[2:])
     if not folder.exists():
         raise PolicyError(f"no policy {given!r}; allowed: a policy folder, or one of {', '.join(names())}")
     return folder

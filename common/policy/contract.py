@@ -5,7 +5,7 @@ import json
 from importlib.metadata import version as package_version
 from typing import Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import ReportedError
 from common.policy.actor_critic import NetworkConfig
@@ -34,10 +34,10 @@ class Contract(BaseModel):
     experience: ExperienceConfig  # how training played the task
     network: NetworkConfig
     run: str
-    generation: int
-    version: int
-    stage: int
-    frames: int
+    generation: int = Field(ge=0)
+    version: int = Field(ge=0)
+    stage: int = Field(ge=1, le=3)
+    frames: int = Field(ge=0)
     measures: dict[str, Any] = {}
     made_with: dict[str, str] = {}
 

@@ -5,9 +5,10 @@ output with its unit, and says how the policy was trained.
 """
 
 import copy
+import hashlib
+import json
 import os
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +26,14 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.contract import Contract, PolicyError, described, same_numbers
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import load_state, new_network, observation_moments, state_tensors
+from common.service.whole_file import write_whole
 from common.task.observation import ACTION, ACTION_SIZE, offsets, policy_layout, size
 
 WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _ACTING: Final = ("trunk.", "mean.", "log_std")  # the policy's parameters; the others are the critic's
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
 _MOMENTS: Final = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)
+_OWN_CONTRACT, _REPLACED = "contract", "replaces"  # texts that the weights carry
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,58 +66,57 @@ class Policy:
         return f"observation {row}: {name}[{column - part.start}] is {obs[row, column]}; allowed: a finite number"
 
 
-def write_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
-    """Write the two files of a policy, without its critic, into ``folder``; no process may read it meanwhile."""
-    folder.mkdir(parents=True, exist_ok=True)
+def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
+    """Write a policy, without its critic; a reader gets the old one or the new one, never a mixture.
+
+    The folder holds two plain files, and each is replaced in one step: first the weights, then the contract. The
+    weights carry a copy of the contract, and a digest of the contract file that it replaces. So `load_policy` finds
+    the right contract also where the writer is between the two files, or was killed there.
+    """
+    _make_plain(folder)
     tensors: dict[str, npt.NDArray[Any]] = {
         name: value for name, value in state_tensors(network).items() if name.startswith(_ACTING)
     }
     acting = moments.first(network.obs_size)
     tensors[_OBS_MEAN], tensors[_OBS_VAR] = acting.mean, acting.var
     tensors[_OBS_COUNT] = np.array(acting.count, np.int64)
-    (folder / WEIGHTS_FILE).write_bytes(save_tensors(tensors))
-    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
+    text = contract.model_dump_json(indent=2) + "\n"
+    file = folder / CONTRACT_FILE
+    replaced = _digest(file.read_bytes()) if file.exists() else ""
+    weights = save_tensors(tensors, metadata={_OWN_CONTRACT: text, _REPLACED: replaced})
+    write_whole(folder / WEIGHTS_FILE, weights)
+    write_whole(file, text)
 
 
-def save_policy(folder: Path, network: ActorCritic, moments: Moments, contract: Contract) -> None:
-    """Write a policy folder; a reader gets the old policy or the new one, never a mixture.
-
-    The folder is a symbolic link that is replaced in one step. The previous folder stays until the next save, since
-    processes may be reading it. Older ones are deleted.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    fresh.chmod(0o755)
-    write_policy(fresh, network, moments, contract)
-    for path in fresh.iterdir():
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-    old = folder.parent / os.readlink(folder) if folder.is_symlink() else None
-    link = folder.parent / f"{fresh.name}.link"
-    link.symlink_to(fresh.name)
-    os.replace(link, folder)
-    for other in folder.parent.glob(f".{folder.name}-*"):
-        if other not in (fresh, old):
-            shutil.rmtree(other, ignore_errors=True)
+def _make_plain(folder: Path) -> None:
+    """Make a policy folder; where it is a link, as in earlier releases, what it points to takes its place."""
+    if folder.is_symlink():
+        target = folder.parent / os.readlink(folder)
+        folder.unlink()
+        if target.parent == folder.parent and target.is_dir():
+            target.rename(folder)
+        for old in folder.parent.glob(f".{folder.name}-*"):
+            shutil.rmtree(old, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
 
 
 def load_policy(folder: Path) -> Policy:
     """Return the policy in ``folder``; raises PolicyError with one line where it can't be used."""
-    folder = Path(os.path.realpath(folder))
+    weights_file, contract_file = folder / WEIGHTS_FILE, folder / CONTRACT_FILE
     try:
-        contract = Contract.model_validate_json((folder / CONTRACT_FILE).read_text())
-        tensors = load_tensors((folder / WEIGHTS_FILE).read_bytes())
+        weights, text = _read_both(weights_file, contract_file)
+        tensors = load_tensors(weights)
+        carried = _metadata(weights)
     except OSError as error:
         raise PolicyError(
             f"no policy in {folder}: {error.strerror} ({Path(error.filename or '').name}); "
             f"wanted is a folder with {WEIGHTS_FILE} and {CONTRACT_FILE}"
         ) from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise PolicyError(f"{folder / CONTRACT_FILE}: {where or 'file'}: {first['msg']}") from None
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise PolicyError(f"{folder / WEIGHTS_FILE} is not readable as safetensors: {error}") from None
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a dtype that numpy lacks
+        raise PolicyError(f"{weights_file} is not readable as safetensors: {error}") from None
+    if carried.get(_REPLACED) == _digest(text):  # the writer has not replaced the contract yet
+        text = carried.get(_OWN_CONTRACT, "").encode()
+    contract = _judged(text, contract_file)
     options = contract.task.observation
     layout = policy_layout(options)
     if not (
@@ -122,21 +124,57 @@ def load_policy(folder: Path) -> Policy:
         and same_numbers(contract.action, described(ACTION))
     ):
         raise PolicyError(
-            f"{folder / CONTRACT_FILE}: its observation or action layout is not this version's "
+            f"{contract_file}: its observation or action layout is not this version's "
             f"({size(layout)} and {ACTION_SIZE} numbers, see common/task/observation.py)"
         )
     for name in _MOMENTS:
         if name not in tensors:
-            raise PolicyError(f"{folder / WEIGHTS_FILE} lacks {name!r}")
-    moments = observation_moments(tensors[_OBS_MEAN], tensors[_OBS_VAR], int(tensors[_OBS_COUNT]), layout)
+            raise PolicyError(f"{weights_file} lacks {name!r}")
     network = new_network(contract.network, options.model_copy(update={"critic": "policy"}))
     blank = {
         name: np.zeros_like(value)
         for name, value in state_tensors(network).items()
         if not name.startswith(_ACTING)
     }
-    load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    try:
+        moments = observation_moments(tensors[_OBS_MEAN], tensors[_OBS_VAR], tensors[_OBS_COUNT], layout)
+        load_state(network, blank | {name: value for name, value in tensors.items() if name not in _MOMENTS})
+    except PolicyError as error:
+        raise PolicyError(f"{weights_file}: {error}") from None
     return Policy(network, moments, contract)
+
+
+def _read_both(weights_file: Path, contract_file: Path) -> tuple[bytes, bytes]:
+    """Return the bytes of both files; the weights were the same before and after the contract was read."""
+    weights = weights_file.read_bytes()
+    while True:
+        text = contract_file.read_bytes()
+        before, weights = weights, weights_file.read_bytes()
+        if weights == before:
+            return weights, text
+
+
+def _metadata(weights: bytes) -> dict[str, str]:
+    """Return the texts that a safetensors file carries; {} where it has none."""
+    length = int.from_bytes(weights[:8], "little")
+    return dict(json.loads(weights[8 : 8 + length]).get("__metadata__") or {})
+
+
+def _judged(text: bytes, file: Path) -> Contract:
+    """Return a contract; raises PolicyError with file, field, value and what is allowed."""
+    try:
+        return Contract.model_validate_json(text.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise PolicyError(f"{file} is not text in UTF-8: {error.reason} at byte {error.start}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        got = f", got {first['input']!r:.100}" if where and first["type"] != "missing" else ""
+        raise PolicyError(f"{file}: {where or 'file'}: {first['msg']}{got}") from None
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _shape(contract: Contract) -> dict[str, Any]:

@@ -67,22 +67,35 @@ def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) ->
             raise PolicyError(
                 f"weights {name!r} have shape {value.shape}; allowed is {tuple(own[name].shape)}"
             )
-        if not np.isfinite(value).all():
+        if value.dtype.kind != "f":
+            raise PolicyError(f"weights {name!r} are {value.dtype}; allowed are floating-point numbers")
+        with np.errstate(over="ignore"):
+            is_finite = np.isfinite(value.astype(np.float32)).all()
+        if not is_finite:
             raise PolicyError(f"weights {name!r} are not finite")
     network.load_state_dict({name: torch.from_numpy(np.array(value)) for name, value in tensors.items()})
 
 
 def observation_moments(
-    mean: npt.NDArray[np.float64],
-    var: npt.NDArray[np.float64],
-    count: int,
-    layout: tuple[Part, ...],
+    mean: npt.NDArray[Any], var: npt.NDArray[Any], count: npt.ArrayLike, layout: tuple[Part, ...]
 ) -> Moments:
     """Return the moments that came with a policy; raises PolicyError if they are not those of ``layout``."""
     allowed = (size(layout),)
     if not mean.shape == var.shape == allowed:
         raise PolicyError(f"observation moments of shapes {mean.shape} and {var.shape}; allowed is {allowed}")
-    return Moments(mean, var, count)
+    _check("obs_moments.mean", mean, np.isfinite(mean), "finite numbers")
+    _check("obs_moments.var", var, np.isfinite(var) & (var >= 0), "finite numbers that are not negative")
+    number = np.asarray(count)
+    if number.shape != () or number.dtype.kind not in "iu" or number < 1:
+        raise PolicyError(f"obs_moments.count is {number.tolist()!r:.60}; allowed is one whole number from 1")
+    return Moments(mean.astype(np.float64), var.astype(np.float64), int(number))
+
+
+def _check(name: str, values: npt.NDArray[Any], is_good: npt.NDArray[np.bool_], allowed: str) -> None:
+    """Raise PolicyError with the first value that is not good."""
+    if not is_good.all():
+        worst = int(np.argmin(is_good))
+        raise PolicyError(f"{name}[{worst}] is {values[worst]}; allowed are {allowed}")
 
 
 def install(

@@ -33,10 +33,15 @@ from common.service.config_help import Setting, format_help, settings_of
 from common.service.whole_file import write_whole
 
 ENVIRONMENT_PREFIX: Final = "TOPSPIN_"
-TABLES: Final = (
+RUN_TABLES: Final = (
     *("task", "experience", "network"),
-    *("generator", "actor", "learner", "evaluator", "router"),
-    *("local", "play", "evaluate", "pictures", "real2sim", "report", "release", "export", "certs", "bench"),
+    *("generator", "actor", "learner", "evaluator"),
+    "local",
+)
+"""Tables of a run's file, which all its programs read, each what it needs."""
+TABLES: Final = (
+    *RUN_TABLES,
+    *("play", "evaluate", "pictures", "real2sim", "report", "release", "export", "certs", "router", "bench"),
 )
 """Tables of a settings file. A nested model of one of these names is read from that table, whatever the program."""
 SHARED: Final = (
@@ -244,6 +249,8 @@ def _read(
     environ = os.environ if environ is None else environ
     flags, file = _read_flags(argv, program)
     environment = _read_environment(environ, program)
+    if file:
+        _check_use(file, program)
     file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
     return flags, environment, _read_file(file, program) if file else _Layer()
 
@@ -303,6 +310,20 @@ def _read_environment(environ: Mapping[str, str], program: _Program) -> _Layer:
             raise ConfigError(f"unknown variable {variable}{_suggestion(variable, [*own, *shared])}")
         layer.put(path, program.settings[path].parse(environ[variable]), variable)
     return layer
+
+
+def _check_use(file: str, program: _Program) -> None:
+    """Raise ConfigError if a file that was given to this program has a table of another, or nothing for this one."""
+    content = read_toml(Path(file))
+    own = {path.split(".")[0] for path in program.settings if "." in path} & set(TABLES) | {program.section}
+    reads = f"{program.prog} reads {', '.join(f'[{table}]' for table in TABLES if table in own)}"
+    allowed = own | (set(RUN_TABLES) if own & set(RUN_TABLES) else set())
+    for table in content:
+        if table in TABLES and table not in allowed:
+            raise ConfigError(f"[{table}] in {file} is not used: {reads}")
+    known = content.keys() & {*TABLES, *SHARED}  # _read_file names the others
+    if known == content.keys() != set() and not known & (own | program.settings.keys()):
+        raise ConfigError(f"nothing in {file} is used: {reads}; got {', '.join(sorted(content))}")
 
 
 def _read_file(file: str, program: _Program) -> _Layer:

@@ -9,6 +9,7 @@
 """
 
 import errno
+import io
 import logging
 import math
 import os
@@ -40,9 +41,21 @@ STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ReportedError: FAILED,
 }
 
-# Faults of the machine and not of the program, also where the error names no file.
+# Faults of the machine or of what a person made of it, and not of the program, also where the error names no file.
 MACHINE_FAULTS: Final = frozenset(
-    {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ENOMEM, errno.EMFILE}
+    {
+        *(
+            errno.ENOSPC,
+            errno.EDQUOT,
+            errno.EFBIG,
+            errno.EROFS,
+            errno.EIO,
+            errno.ESTALE,
+            errno.EACCES,
+            errno.EPERM,
+        ),
+        *(errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.EAGAIN, errno.EPIPE),
+    }
 )
 
 SECOND_SIGNAL_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 15.0}
@@ -61,6 +74,7 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
         prog: How the program is called; starts the line of an error.
         main: Runs the service and returns its status; raises errors that it can't handle.
     """
+    own_environment()
     stop = stop_on_signals()
     try:
         status = main(stop)
@@ -75,13 +89,23 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
             log.exception("stopped by a bug")
         else:
             where = f"{error.filename}: " if error.filename is not None else ""
-            sys.stderr.write(f"{prog}: {where}{error.strerror}\n")
+            sys.stderr.write(f"{prog}: {where}{error.strerror or error}\n")
+        status = FAILED
+    except MemoryError as error:
+        sys.stderr.write(f"{prog}: {str(error) or os.strerror(errno.ENOMEM)}\n")
         status = FAILED
     except Exception:
         log.exception("stopped by a bug")
         status = FAILED
     _exit_at_the_latest(status)
     return status
+
+
+def own_environment() -> None:
+    """Set what a person's environment sets for other programs, and what would stop or change ours."""
+    os.environ["MPLBACKEND"] = "agg"  # figures go to files; a notebook's own can't be loaded here
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # an encoding without our signs
 
 
 def stop_on_signals() -> threading.Event:

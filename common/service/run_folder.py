@@ -1,6 +1,5 @@
-"""A run's folder: its paths, its locks, and its tables, which may be read while a service writes them."""
+"""A run's folder: its paths and its locks."""
 
-import csv
 import errno
 import fcntl
 import logging
@@ -17,6 +16,7 @@ log = logging.getLogger(__name__)
 
 RUNS = Path("runs")
 LATEST = "latest"
+CONFIG = "config.toml"
 
 Holder = Literal["learner", "deploy.local"]
 LOCKS: Final[dict[Holder, str]] = {"deploy.local": ".deploy.lock", "learner": ".lock"}
@@ -29,16 +29,13 @@ class RunAliveError(ReportedError):
     """Another process uses the run folder: one line that names it."""
 
 
-def whole_rows(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's CSV file, by column; none where there is no file.
-
-    An incomplete line at the end is left out: it is being written, or its writer was killed.
-    """
-    if not path.is_file():
-        return []
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        lines = [line for line in file if line.endswith("\n")]
-    return [row for row in csv.DictReader(lines) if None not in row.values() and None not in row]
+def newest_run() -> str:
+    """Return the name of the newest run: that of runs/latest, else the one whose settings were written last, or ""."""
+    link = RUNS / LATEST
+    if link.is_symlink() and (link / CONFIG).is_file():
+        return link.resolve().name
+    files = [file for file in RUNS.glob(f"*/{CONFIG}") if file.parent.name != LATEST]
+    return max(files, key=lambda file: file.stat().st_mtime).parent.name if files else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +46,15 @@ class RunFolder:
 
     @staticmethod
     def of(run: str, folder: str = "") -> "RunFolder":
-        """Return the folder of a run: runs/RUN unless another is given."""
-        return RunFolder(Path(folder) if folder else RUNS / run)
+        """Return the folder of a run: runs/RUN unless another is given; ``latest`` is the newest run."""
+        if folder:
+            return RunFolder(Path(folder))
+        return RunFolder(RUNS / ((newest_run() or LATEST) if run == LATEST else run))
 
     @property
     def config(self) -> Path:
         """Every setting of the run."""
-        return self.root / "config.toml"
+        return self.root / CONFIG
 
     @property
     def metrics(self) -> Path:
@@ -176,8 +175,15 @@ class RunFolder:
             )
 
     def point_latest_here(self) -> None:
-        """Point runs/latest to this run."""
+        """Point runs/latest to this run; a convenience for people, which a file system without links does not have."""
         link = self.root.parent / LATEST
+        if link.is_dir() and not link.is_symlink():
+            log.warning("%s is a folder and not a link to the newest run; it stays as it is", link)
+            return
         fresh = link.with_name(f".{LATEST}-{os.getpid()}")
-        fresh.symlink_to(self.root.name)
-        os.replace(fresh, link)
+        try:
+            fresh.unlink(missing_ok=True)
+            fresh.symlink_to(self.root.name)
+            os.replace(fresh, link)
+        except OSError as error:
+            log.info("no link to the newest run file=%s reason=%s", link, error.strerror)

@@ -5,14 +5,23 @@ from contextlib import suppress
 from pathlib import Path
 
 
-def write_whole(file: Path, text: str) -> None:
-    """Replace a file in one step; after a crash or a power cut it holds the old text or the new one."""
+def write_whole(file: Path, content: str | bytes) -> None:
+    """Replace a file in one step; after a crash or a power cut it holds the old content or the new one.
+
+    Raises:
+        OSError: It can't be written, such as on a full disk; the old one is as it was.
+    """
     part = file.with_name(f"{file.name}.part")
-    with part.open("w", encoding="utf-8") as out:
-        out.write(text)
-        out.flush()
-        os.fsync(out.fileno())
-    os.replace(part, file)
+    try:
+        with part.open("wb") as out:
+            out.write(content.encode() if isinstance(content, str) else content)
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(part, file)
+    except OSError:
+        with suppress(OSError):
+            part.unlink()
+        raise
     sync_folder(file.parent)
 
 

@@ -14,7 +14,7 @@ set -euo pipefail
 
 run=${1:?usage: sbatch topspin.slurm.sh NAME}
 export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
-python=${TOPSPIN_PYTHON:-python}
+python=${PYTHON:-python} # not TOPSPIN_...: those are settings
 folder=runs/$run # on a file system that all nodes see
 settings=$folder/slurm.toml
 mkdir -p "$folder/logs"

@@ -11,9 +11,9 @@ import torch
 from common.comms.messages import Episodes, PolicySnapshot, Rollout
 from common.env.hit_corrections import HitCorrections
 from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
-from common.env.teacher import teacher_of
+from common.env.teacher import Teacher, teacher_of
 from common.policy.actor_critic import NetworkConfig, log_prob
-from common.policy.contract import training_hash
+from common.policy.contract import PolicyError, training_hash
 from common.policy.network_pass import NetworkPass, native_precision
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import install, new_network
@@ -55,7 +55,12 @@ class Player:
         note: Callable[[FinishedRallies], None] = lambda _: None,
     ) -> None:
         torch.set_num_threads(1)  # a second thread makes small products slower and uses the learner's core
-        self._teacher = teacher_of(task, experience.teacher)
+        self._teacher: Teacher | None = None
+        self._no_teacher: PolicyError | None = None
+        try:
+            self._teacher = teacher_of(task, experience.teacher)
+        except PolicyError as error:  # only a policy that still learns from it needs it
+            self._no_teacher = error
         extra = self._teacher.observation if self._teacher else None
         self.env = RallyEnv(envs, task, source, experience=experience, extra_observation=extra)
         self.training_hash = training_hash(task, network, experience)
@@ -86,6 +91,9 @@ class Player:
         """Return the next block, numbered and stamped. Environments continue where the last block ended.
 
         The action noise is a function of seed and sequence alone, so that a run can be repeated.
+
+        Raises:
+            PolicyError: The policy still learns from a teacher that can't be read.
         """
         snapshot = self.snapshot
         if snapshot is None:
@@ -102,7 +110,10 @@ class Player:
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
-        teacher = self._teacher if self.env.experience.teacher.teaches(snapshot.version) else None
+        is_taught = self.env.experience.teacher.teaches(snapshot.version)
+        if is_taught and self._no_teacher is not None:
+            raise self._no_teacher
+        teacher = self._teacher if is_taught else None
         terms = np.zeros(len(TERMS))
         inference = simulation = 0.0
         width = self._network.obs_size

@@ -56,7 +56,6 @@ class RallyFeed:
         self._rallies: Subscription | None = None
         if config.rallies == "subscribe":
             self._rallies = transport.subscribe(self._key, capacity=RALLY_BATCHES)
-            member.watch("rally", self._rallies)
         self._batches: deque[RallyBatch] = deque()
         self._block = 0
         self._counted, self._runs_short = (
@@ -68,6 +67,11 @@ class RallyFeed:
     def asks(self) -> bool:
         """Whether blocks are requested by index."""
         return self._rallies is None
+
+    @property
+    def unneeded(self) -> int:
+        """Number of batches that newer ones replaced in the mailbox: an actor with rallies enough lets them go."""
+        return self._rallies.dropped if self._rallies is not None else 0
 
     def refill(self, buffer: RallyBuffer) -> None:
         """Fill the buffer with batches that have arrived, or with the next block."""

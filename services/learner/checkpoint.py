@@ -5,10 +5,8 @@ wait at a planned stop. The rest, `Progress` and what the service adds (stage lo
 metadata. Every tensor and the JSON have a checksum, so a damaged file is told from one of other settings.
 """
 
-import errno
 import json
 import logging
-import os
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -19,13 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save as save_tensors
 
 from common.errors import ReportedError
 from common.policy.contract import PolicyError
 from common.policy.normalizer import Moments
 from common.policy.weights import load_state, state_tensors
-from common.service.whole_file import sync_folder
+from common.service.whole_file import write_whole
 from services.learner.divergence import Health
 from services.learner.epoch_stats import Progress
 from services.learner.training import Training
@@ -95,17 +93,10 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{training.progress.version:08d}{SUFFIX}"
-    part = path.with_suffix(".part")
     text = json.dumps(about)
-    try:
-        save_file(tensors, part, metadata={"topspin": text, "checksum": str(zlib.crc32(text.encode()))})
-    except SafetensorError as error:  # a full disk, in words
-        part.unlink(missing_ok=True)
-        raise OSError(errno.EIO, str(error), str(part)) from None
-    with part.open("rb") as file:
-        os.fsync(file.fileno())
-    os.replace(part, path)
-    sync_folder(folder)
+    write_whole(
+        path, save_tensors(tensors, metadata={"topspin": text, "checksum": str(zlib.crc32(text.encode()))})
+    )
     for stale in folder.glob("*.part"):  # of a process that ended within a save
         stale.unlink(missing_ok=True)
     for old in checkpoints(folder)[:-KEPT]:
@@ -114,10 +105,9 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
 
 
 def keep(path: Path, folder: Path) -> None:
-    """Make ``path`` the only checkpoint in ``folder``, by a hard link instead of a copy."""
+    """Make a copy of ``path`` the only checkpoint in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / path.name).unlink(missing_ok=True)
-    os.link(path, folder / path.name)
+    write_whole(folder / path.name, path.read_bytes())
     for old in checkpoints(folder):
         if old.name != path.name:
             old.unlink(missing_ok=True)
@@ -140,7 +130,7 @@ def restore(path: Path, training: Training) -> Extras:
     """Load a checkpoint into ``training`` and return the service's extras.
 
     Raises:
-        DamagedCheckpointError: The file is missing or damaged; ``training`` is unchanged.
+        DamagedCheckpointError: The file is missing, unreadable or damaged; ``training`` is unchanged.
         CheckpointError: It is of another network; ``training`` may be half changed.
     """
     about, tensors = _read(path)
@@ -184,13 +174,15 @@ def restore_newest(folder: Path, training: Training) -> tuple[Path, Extras]:
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
     """Return the JSON and the tensors of a checkpoint that are as they were written."""
     try:
+        path.open("rb").close()  # safetensors has one error for all that can't be opened
+    except OSError as error:
+        raise DamagedCheckpointError(f"can't read checkpoint {path}: {error.strerror}") from None
+    try:
         with safe_open(path, framework="numpy") as file:
             metadata: Mapping[str, str] = file.metadata() or {}
             about = json.loads(metadata["topspin"])
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             found = about["format"]
-    except FileNotFoundError:
-        raise DamagedCheckpointError(f"no checkpoint {path}") from None
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise DamagedCheckpointError(f"checkpoint {path} is not readable: {error}") from None
     if found == WITHOUT_CHECKSUMS:

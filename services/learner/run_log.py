@@ -5,8 +5,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from common.errors import ReportedError
+from common.service import table
 from common.service.table import Table
-from common.service.whole_file import write_whole
 from common.task.reward import TERMS
 from common.task.states import Outcome
 from services.learner.epoch_stats import EpochStats
@@ -16,6 +17,10 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+
+class RunLogError(ReportedError):
+    """A run's metrics.csv is no table of epochs: one line with the file."""
 
 
 def row(stats: EpochStats, seconds: float, frames_per_s: float) -> dict[str, float]:
@@ -84,16 +89,26 @@ class RunLog:
             self._events = None  # its thread has ended: the next epoch begins another file
             log.error("can't write folder=%s reason=%s", self._tensorboard, error.strerror)
 
-    def truncate(self, epoch: int) -> None:
-        """Drop rows after ``epoch``: epochs that a resumed run trains again."""
-        if not self._path.exists():
-            return
-        with self._path.open(newline="") as file:
-            lines = file.readlines()
-        # a learner that was killed may have left an incomplete line at the end
-        rows = [line for line in lines[1:] if line.endswith("\n") and int(line.split(",", 1)[0]) <= epoch]
-        kept = lines[:1] + rows
-        write_whole(self._path, "".join(kept))
+    def truncate(self, epoch: int, frames: int) -> None:
+        """Drop rows after ``epoch``, and TensorBoard's events after ``frames``: what a resumed run trains again.
+
+        Raises:
+            RunLogError: The table has no column ``epoch``.
+        """
+        found = table.read(self._path)
+        if found.columns:
+            if "epoch" not in found.columns:
+                raise RunLogError(f"{self._path}:1: no column epoch; got {', '.join(found.columns):.100}")
+            # a learner that was killed may have left an incomplete line at the end
+            kept = [row for row in found.rows if not float(row["epoch"] or "nan") > epoch]
+            table.set_aside(self._path, found.refused)
+            table.rewrite(self._path, found.columns, kept)
+        files = sorted(self._tensorboard.glob("events.*"), reverse=True)
+        if files:  # imported late, as in `_write_events`
+            from services.learner.event_files import cut_after  # noqa: PLC0415
+        for file in files:
+            if not cut_after(file, frames):
+                break
 
     def close(self) -> None:
         """Write TensorBoard's buffer."""

@@ -101,8 +101,8 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         task, teacher = config.task, config.experience.teacher
-        # Raises here if the teacher does not fit: otherwise actors would end because of it and be restarted for ever
-        teacher_of(task, teacher)
+        if not config.resume:
+            teacher_of(task, teacher)  # before a folder is made
         self._folder.create()
         self._run_log = RunLog(self._folder.metrics, self._folder.tensorboard)
         self._intake_config = config.intake.for_actors(config.actors)
@@ -121,12 +121,15 @@ class LearnerService:
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
         extras = self._restore() if config.resume else None
+        if self.training.is_distilling:
+            # Raises here if the teacher does not fit: otherwise actors would end because of it, for ever restarted
+            teacher_of(task, teacher)
         stages = tuple(StageChange(**change) for change in extras.stage_log) if extras else ()
         self._generation = next_generation(self._folder.generation, extras.generation if extras else 0)
         # After the checkpoint has proved that they fit
         save_settings(self._folder.config, to_tables(config, "learner"))
         if not config.resume:
-            self._run_log.truncate(0)  # rows of a process that ended before its first checkpoint
+            self._run_log.truncate(0, -1)  # rows of a process that ended before its first checkpoint
         self._intake = self._new_intake(extras)
         self._alive: set[tuple[str, str, int]] = set()
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
@@ -259,9 +262,12 @@ class LearnerService:
             self._save(is_last)
         except OSError as error:
             self._metrics.inc("topspin_failed_saves_total")
-            text = f"epoch {self.training.progress.epoch} can't be saved in {self._folder.root}: {error.strerror}"
+            where = error.filename or self._folder.root
+            text = f"epoch {self.training.progress.epoch} can't be saved in {where}: {error.strerror}"
             if is_last:
-                raise NotSavedError(f"{text}; what an earlier checkpoint holds is kept") from None
+                older = checkpoint.checkpoints(self._folder.checkpoints)
+                kept = f"the newest checkpoint is {older[-1]}" if older else "there is no checkpoint"
+                raise NotSavedError(f"{text}; {kept}") from None
             log.error("%s; training goes on, next try in %.0f s", text, self._config.checkpoint_interval_s)
 
     def _save(self, is_last: bool) -> None:
@@ -360,7 +366,8 @@ class LearnerService:
         """Load the newest whole checkpoint; return what the service keeps in it."""
         file, extras = checkpoint.restore_newest(self._folder.checkpoints, self.training)
         self._clocks.resumed_seconds = extras.trained_seconds
-        self._run_log.truncate(self.training.progress.epoch)
+        progress = self.training.progress
+        self._run_log.truncate(progress.epoch, progress.frames)
         log.info(
             "resumed file=%s epoch=%d frames=%d waiting=%d",
             file,

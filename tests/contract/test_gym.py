@@ -1,5 +1,6 @@
 """Gymnasium's requirements on an environment, for the single one and the batch."""
 
+import copy
 import warnings
 
 import gymnasium
@@ -13,6 +14,7 @@ from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
 from common.task.states import Outcome
 from tests.unit.env.rallies import make_env
+from topspin.gym import RallyGymEnv, RallyVectorEnv
 from topspin.gym_ids import ENV_ID
 
 
@@ -228,3 +230,92 @@ def test_the_batch_plays_as_its_inner_environment():
 
     assert inner.count == 4
     assert inner.home_action.shape == make_env(1).home_action.shape
+
+
+def test_a_reset_mask_begins_those_episodes_and_leaves_the_others():
+    envs, untouched = make_vec(4, randomization="off"), make_vec(4, randomization="off")
+    for each in (envs, untouched):
+        each.reset(seed=1)
+        each.step(np.zeros((4, 7), np.float32))
+    mask = np.array([False, True, False, True])
+    before, *_ = untouched.step(np.zeros((4, 7), np.float32))
+    envs.step(np.zeros((4, 7), np.float32))
+    obs, info = envs.reset(options={"reset_mask": mask})
+
+    np.testing.assert_array_equal(obs[~mask], before[~mask])
+    assert not np.any(np.all(obs[mask] == before[mask], axis=1))
+    assert info == {}
+    np.testing.assert_array_equal(
+        envs.step(np.zeros((4, 7), np.float32))[0][~mask],
+        untouched.step(np.zeros((4, 7), np.float32))[0][~mask],
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "seed", "message"),
+    [
+        (
+            {"reset_mask": np.array([True])},
+            None,
+            r"reset_mask of shape \(1,\) and bool, 1 set; allowed: \(4,\)",
+        ),
+        ({"reset_mask": np.ones(4)}, None, "and float64, 4 set; allowed"),
+        ({"reset_mask": np.zeros(4, np.bool_)}, None, "0 set; allowed"),
+        ({"reset_mask": np.array([True, False, False, False])}, 3, "seed with a reset_mask"),
+        (None, [1, 2], r"seed \[1, 2\]; allowed: a whole number from 0, or 4 of them"),
+        (None, [1, 2, 3, None], "seed .*None.*; allowed"),
+    ],
+)
+def test_a_reset_of_the_batch_that_it_can_not_do_is_refused(options, seed, message):
+    envs = make_vec(4)
+    envs.reset(seed=1)
+
+    with pytest.raises(ValueError, match=message):
+        envs.reset(seed=seed, options=options)
+
+
+def test_a_seed_for_each_environment_repeats_the_episodes():
+    envs = make_vec(3)
+    first, _ = envs.reset(seed=[1, 2, 3])
+    again, _ = make_vec(3).reset(seed=[1, 2, 3])
+    other, _ = envs.reset(seed=[1, 2, 4])
+
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize("made", [make, make_vec], ids=["single", "batch"])
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"launch": "wild"}, "launch = 'wild'; Input should be 'paper', 'strong'"),
+        ({"launsh": "paper"}, "unknown setting 'launsh'; did you mean 'launch'"),
+        ({"stage": 4}, "stage 4; allowed: 1, 2, 3"),
+        ({"control_rate_hz": 60}, "control_rate_hz = 60; Input should be 25, 50, 100 or 200"),
+        ({"continue_share": 2.0}, "continue_share = 2.0; Input should be less than or equal to 1"),
+    ],
+)
+def test_a_bad_setting_is_one_line_with_what_is_allowed(made, settings, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        made(**settings)
+
+    assert "\n" not in str(caught.value)
+
+
+def test_a_render_mode_is_refused_and_rendering_without_one_returns_none():
+    with pytest.raises(ValueError, match="render_mode 'human'; allowed: None"):
+        RallyGymEnv(render_mode="human")
+    with pytest.raises(
+        ValueError, match=r"autoreset_mode AutoresetMode.NEXT_STEP; allowed: AutoresetMode.SAME"
+    ):
+        RallyVectorEnv(2, autoreset_mode=AutoresetMode.NEXT_STEP)
+    for env in (RallyGymEnv(), RallyVectorEnv(2)):
+        with pytest.warns(UserWarning, match="without a render_mode returns None"):
+            assert env.render() is None
+
+
+def test_a_copy_is_refused_with_what_to_do():
+    for env in (make(), make_vec(2)):
+        env.reset(seed=1)
+        with pytest.raises(TypeError, match="can't be copied; make another with the same settings"):
+            copy.deepcopy(env)

@@ -384,3 +384,22 @@ def test_an_actor_that_runs_out_of_rallies_logs_it_once(tmp_path, caplog):
     assert caplog.text.count("rallies run out") == 1
     assert "raise the generators' rate_hz, or add generators" in caplog.text
     assert actor.metric("topspin_rally_underruns_total") > 0
+
+
+def test_rallies_that_an_idle_actor_lets_go_count_as_neither_dropped_nor_lost(tmp_path):
+    with local_run(tmp_path, curriculum=LONG) as s:
+        learner = s.learner(run=False)  # the hub; it answers nothing, so the actor is idle
+        generator, actor = s.generator(), s.actor(0)
+        feed = actor.service._feed
+        wait_until(lambda: feed.unneeded >= 3, 30, "batches that the idle actor does not need")
+        learner.start()
+        wait_until(lambda: actor.service._buffer.counts.gaps >= 3, 60, "the gap that they leave")
+        wait_until(lambda: actor.metric("topspin_rallies_consumed_total") > 0, 30, "a heartbeat")
+        found = actor.scrape()
+        for entry in (actor, generator, learner):
+            entry.end()
+
+    assert found["topspin_rally_gaps_total"] == 0
+    assert not any(
+        value for name, value in found.items() if name.startswith("topspin_messages_dropped_total")
+    )

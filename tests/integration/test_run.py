@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 
 import pytest
 import torch
@@ -81,9 +82,8 @@ def test_a_run_with_the_papers_switches_changes_stages_by_frames_and_saves_its_n
 def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp_path):
     teacher = write_teacher(tmp_path / "teacher").model_copy(update={"epochs": 3})
     experience = ExperienceConfig(teacher=teacher)
-    with local_run(
-        tmp_path / "run", curriculum=CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6})
-    ) as s:
+    curriculum = CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6})
+    with local_run(tmp_path / "run", curriculum=curriculum) as s:
         learner = s.learner(experience=experience)
         generator, actors = s.generator(), [s.actor(k, experience=experience) for k in range(2)]
         learner.join(60)
@@ -92,10 +92,14 @@ def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp
         ledger = learner.service.ledger()
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
+    shutil.rmtree(tmp_path / "teacher")
+    with local_run(tmp_path / "run", curriculum=curriculum) as s:  # a resume needs the teacher no more
+        resumed = s.learner(run=False, experience=experience, resume=True)
 
     taught, later = rows[:3], rows[3:]
     assert later
     assert all(float(row["correction_loss"]) > 0 and float(row["policy_loss"]) == 0 for row in taught)
     assert all(float(row["policy_loss"]) != 0 for row in later)
+    assert resumed.service.training.progress.epoch == len(rows)
     assert ledger.refused == {}
     assert ledger.balance == ledger.lost == 0

@@ -48,12 +48,20 @@ class Command:
 
 
 @contextlib.contextmanager
-def running(folder, module, *arguments):
-    """Yield `python -m module arguments`, run in ``folder``; it is killed if it still runs at the end."""
+def running(folder, module, *arguments, environ=(), before=None):
+    """Yield `python -m module arguments`, run in ``folder``; it is killed if it still runs at the end.
+
+    Args:
+        folder: Where.
+        module: What.
+        arguments: Its flags.
+        environ: More variables of its environment.
+        before: Called in the new process before the program starts.
+    """
     name = f"{module}-{time.monotonic_ns()}"
     out, err = folder / f"{name}.out", folder / f"{name}.err"
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TOPSPIN_")}
-    environment |= {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    environment |= {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | dict(environ)
     with out.open("w") as out_file, err.open("w") as err_file:
         process = subprocess.Popen(
             [sys.executable, "-m", module, *map(str, arguments)],
@@ -62,6 +70,7 @@ def running(folder, module, *arguments):
             stdin=subprocess.DEVNULL,
             stdout=out_file,
             stderr=err_file,
+            preexec_fn=before,  # noqa: PLW1509 - tests start processes from one thread
         )
     try:
         yield Command(process, out, err)
@@ -71,8 +80,8 @@ def running(folder, module, *arguments):
             process.wait()
 
 
-def run(folder, module, *arguments, timeout_s=90):
-    with running(folder, module, *arguments) as command:
+def run(folder, module, *arguments, timeout_s=90, **how):
+    with running(folder, module, *arguments, **how) as command:
         return command.wait(timeout_s)
 
 

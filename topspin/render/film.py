@@ -148,13 +148,15 @@ def write_film(path: Path, frames: Iterable[Image], width: int, height: int, rat
     count = 0
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        part.touch()  # raises with the reason; of ffmpeg we would see a broken pipe
         with closing(_open_writer(ffmpeg, part, width, height, rate_hz)) as writer:
             for frame in frames:
                 writer.send(np.ascontiguousarray(frame))
                 count += 1
         os.replace(part, path)
     except (OSError, RuntimeError) as error:
-        raise RenderError(f"can't write {path}: {(str(error).splitlines() or [''])[0]}") from None
+        reason = getattr(error, "strerror", None) or (str(error).splitlines() or [""])[0]
+        raise RenderError(f"can't write {path}: {reason}") from None
     finally:
         if part.exists():  # missing_ok does not cover a folder that is a file
             part.unlink()

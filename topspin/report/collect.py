@@ -12,7 +12,8 @@ import numpy.typing as npt
 from common.errors import ReportedError
 from common.policy.contract import PolicyError
 from common.policy.folder import Policy, load_policy
-from common.service.run_folder import RUNS, RunFolder, whole_rows
+from common.service.run_folder import LATEST, RUNS, RunFolder
+from common.service.table import whole_rows
 
 Array = npt.NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def find(run: str) -> RunFolder:
     for folder in (RunFolder.of(run), RunFolder(Path(run))):
         if folder.config.is_file():
             return RunFolder(folder.root.resolve())
-    known = sorted(path.parent.name for path in RUNS.glob("*/config.toml") if not path.parent.is_symlink())
+    known = sorted(path.parent.name for path in RUNS.glob("*/config.toml") if path.parent.name != LATEST)
     there = f"runs there: {', '.join(known)}" if known else f"there are no runs in {RUNS}/"
     raise RunError(f"no run {run!r}: neither {RUNS}/{run} nor {run} is a folder with a config.toml; {there}")
 

@@ -1,14 +1,16 @@
-"""The last line of a run whose learner failed, and the flags of its restart."""
+"""The last line of a run whose learner failed, the flags of its restart, and where a panel is shown."""
 
 import os
+import pty
 import time
 from threading import Event
 
 import pytest
+from rich.console import Console
 
 from common.service.run_folder import RunFolder
 from deploy.config import DeployConfig
-from deploy.local import LEARNER, conclude
+from deploy.local import LEARNER, conclude, shows_panel
 from deploy.prepare import PreparedRun, RunFailedError, link_to_learner
 from deploy.supervisor import Spec, Supervisor
 
@@ -65,3 +67,40 @@ def test_a_restarted_learner_goes_on_from_its_checkpoint_if_there_is_one(tmp_pat
     has_checkpoint(run)
     assert learner.again() == ("--resume",)
     assert "--resume" not in learner.arguments
+
+
+@pytest.mark.parametrize(
+    ("environment", "in_terminal", "in_file"),
+    [
+        ({"TERM": "xterm"}, True, False),
+        ({"TERM": "dumb"}, False, False),
+        ({"TERM": "dumb", "FORCE_COLOR": "1"}, False, False),
+        ({"TERM": "xterm", "FORCE_COLOR": "1"}, True, False),
+        ({"TERM": "xterm", "TTY_COMPATIBLE": "1"}, True, False),
+        ({"TERM": "xterm", "TTY_COMPATIBLE": "0"}, False, False),
+        ({"TERM": "xterm", "TTY_INTERACTIVE": "0"}, False, False),
+    ],
+)
+def test_the_panel_is_shown_only_in_a_terminal_that_can_show_it(
+    tmp_path, monkeypatch, environment, in_terminal, in_file
+):
+    for name in ("TERM", "FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    ours, theirs = pty.openpty()
+    try:
+        with os.fdopen(theirs, "w") as terminal, (tmp_path / "log").open("w") as file:
+            shown = [shows_panel("auto", Console(file=output)) for output in (terminal, file)]
+            off = shows_panel("off", Console(file=terminal))
+    finally:
+        os.close(ours)
+
+    assert shown == [in_terminal, in_file]
+    assert off is False
+
+
+def test_a_panel_that_is_wanted_needs_a_cursor(tmp_path, monkeypatch):
+    monkeypatch.setenv("TERM", "dumb")
+    with (tmp_path / "log").open("w") as file:
+        assert shows_panel("on", Console(file=file, force_terminal=True)) is False

@@ -116,6 +116,13 @@ def test_every_command_of_a_unit_and_of_the_job_is_read_by_its_program(tmp_path)
     assert {c.endpoint for c in read if isinstance(c, LearnerConfig)} == {"tcp/0.0.0.0:7447"}
 
 
+def test_no_variable_of_a_manifest_looks_like_a_setting():
+    """A service refuses a variable TOPSPIN_... that is none of its settings."""
+    by_hand = [(FOLDER / name).read_text() for name in BY_HAND]
+
+    assert [word for text in (*files().values(), *by_hand) for word in re.findall(r"TOPSPIN_\w+", text)] == []
+
+
 def test_containers_have_no_rights_a_read_only_file_system_limits_and_a_health_check():
     for name, service in compose.compose()["services"].items():
         if name not in ("prometheus", "grafana"):

@@ -1,3 +1,5 @@
+import os
+import shutil
 import socket
 import tomllib
 from contextlib import suppress
@@ -8,13 +10,14 @@ import pytest
 
 from common.comms.certificates import CertificateError
 from common.service.config import ConfigError, load, read_toml
-from common.service.run_folder import RunAliveError, RunFolder
+from common.service.run_folder import RunAliveError, RunFolder, newest_run
 from deploy.config import DeployConfig
 from deploy.prepare import (
     PreparedRun,
     RunFailedError,
     link_to_learner,
     metrics_ports,
+    new_name,
     prepared,
     settings,
 )
@@ -316,3 +319,45 @@ def test_an_address_that_cant_be_served_is_one_line():
         ConfigError, match=r"metrics_host 192\.0\.2\.1, port 9100: .*; allowed: an address of this"
     ):
         metrics_ports(CONFIG.model_copy(update={"metrics_host": "192.0.2.1"}))
+
+
+def test_runs_without_a_name_that_start_together_get_names_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    names = [new_name("20260101-120000") for _ in range(3)]
+
+    assert names == ["20260101-120000", "20260101-120000-2", "20260101-120000-3"]
+    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == names
+
+
+def started(*argv):
+    with prepared(read(*argv)) as run:
+        return run
+
+
+def test_runs_that_were_copied_as_plain_files_go_on(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    started("--run", "a")
+    shutil.copytree("runs", tmp_path / "there" / "runs")  # as cp -rL: the link becomes a folder
+    monkeypatch.chdir(tmp_path / "there")
+    run = started("--run", "a", "--resume")
+
+    assert run.name == "a"
+    assert not Path("runs/latest").is_symlink()
+    assert newest_run() == "a"
+
+
+def test_without_the_link_the_newest_run_is_that_which_was_written_last(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, when in (("a", 2_000), ("b", 1_000)):
+        started("--run", name)
+        os.utime(f"runs/{name}/config.toml", (when, when))
+    linked = newest_run()
+    Path("runs/latest").unlink()
+
+    assert linked == "b"
+    assert newest_run() == "a"
+    assert read("--run", "latest", "--resume").run == "a"
+    with pytest.raises(ConfigError, match="--resume needs --run NAME: the newest run is a"):
+        read("--resume")

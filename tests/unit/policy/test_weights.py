@@ -1,10 +1,13 @@
+import itertools
 import json
+import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save_file
 
 from common.policy.actor_critic import NetworkConfig
 from common.policy.box import names, policy_folder
@@ -65,12 +68,52 @@ def test_a_folder_holds_the_policy_and_not_the_critic(tmp_path):
     np.testing.assert_array_equal(policy.act(obs), Policy(network, moments, contract).act(obs))
 
 
-def test_a_newer_policy_replaces_the_older_whose_folder_stays_for_its_readers(tmp_path):
-    for _ in range(4):
+def test_a_policy_folder_holds_two_plain_files(tmp_path):
+    for _ in range(3):
         saved(tmp_path / "latest")
 
-    assert len([path for path in tmp_path.iterdir() if not path.is_symlink()]) == 2
+    assert not (tmp_path / "latest").is_symlink()
+    assert {path.name for path in (tmp_path / "latest").iterdir()} == {WEIGHTS_FILE, CONTRACT_FILE}
+    assert [path.name for path in tmp_path.iterdir()] == ["latest"]
+
+
+def test_a_policy_folder_of_an_earlier_release_that_is_a_link_becomes_plain(tmp_path):
+    saved(tmp_path / ".latest-1")
+    (tmp_path / ".latest-0").mkdir()
+    (tmp_path / "latest").symlink_to(".latest-1")
+    saved(tmp_path / "latest")
+
+    assert not (tmp_path / "latest").is_symlink()
+    assert [path.name for path in tmp_path.iterdir()] == ["latest"]
     assert load_policy(tmp_path / "latest").contract.version == 2
+
+
+def test_a_reader_gets_one_of_the_policies_while_a_writer_replaces_them(tmp_path):
+    network, moments = saved(tmp_path / "p")
+    writer = os.fork()
+    if writer == 0:
+        for version in itertools.count(3):
+            for name, parameter in network.named_parameters():
+                if name.startswith("mean."):
+                    parameter.data.fill_(version)
+            save_policy(tmp_path / "p", network, moments, make_contract(version=version))
+    try:
+        seen = set()
+        while len(seen) < 10:
+            policy = load_policy(tmp_path / "p")
+            if policy.contract.version > 2:
+                assert torch.all(policy.network.state_dict()["mean.bias"] == policy.contract.version)
+                seen.add(policy.contract.version)
+    finally:
+        os.kill(writer, signal.SIGKILL)
+        os.waitpid(writer, 0)
+
+
+def test_a_contract_that_was_edited_counts(tmp_path):
+    saved(tmp_path / "p")
+    edit(tmp_path / "p", "run", "mine")
+
+    assert load_policy(tmp_path / "p").contract.run == "mine"
 
 
 def test_the_mean_of_policies_has_the_mean_of_their_weights_and_lists_them():
@@ -129,11 +172,44 @@ def test_weights_travel_as_bytes_and_arrive_unchanged():
         (lambda folder: edit(folder, "observation", []), "layout is not this version's"),
         (lambda folder: edit(folder, "network", {"units": [16, 9]}), r"shape \(.*\); allowed is"),
         (lambda folder: edit(folder, "network", {"units": [16, 8, 8]}), "weights lack"),
+        (lambda folder: edit(folder, "network", {"units": [10**9]}), r"network.units.0: .*got 1000000000"),
+        (
+            lambda folder: edit(folder, "task", {"control_rate_hz": 33}),
+            r"contract.json: task.control_rate_hz: Input should be 25, 50, 100 or 200, got 33",
+        ),
+        (lambda folder: edit(folder, "stage", 7), "contract.json: stage: .*less than or equal to 3, got 7"),
+        (lambda folder: edit(folder, "frames", -1), "contract.json: frames: .*greater than .* got -1"),
+        (lambda folder: recoded(folder, "utf-16"), "contract.json is not text in UTF-8: .* at byte 0"),
+        (lambda folder: tensor(folder, "obs_moments.var", 3, -1.0), r"obs_moments.var\[3\] is -1.0; allowed"),
+        (
+            lambda folder: tensor(folder, "obs_moments.var", 0, np.inf),
+            r"obs_moments.var\[0\] is inf; allowed",
+        ),
+        (
+            lambda folder: tensor(folder, "obs_moments.var", 0, np.nan),
+            r"obs_moments.var\[0\] is nan; allowed",
+        ),
+        (
+            lambda folder: tensor(folder, "obs_moments.mean", 1, np.nan),
+            r"weights.safetensors: obs_moments.mean\[1\] is nan; allowed are finite numbers",
+        ),
+        (
+            lambda folder: tensor(folder, "obs_moments.count", ..., [1, 2]),
+            r"obs_moments.count is \[1, 2\]; allowed is one",
+        ),
+        (lambda folder: tensor(folder, "obs_moments.count", ..., 0), r"obs_moments.count is 0; allowed"),
+        (lambda folder: tensor(folder, "obs_moments.count", ..., 1.5), r"obs_moments.count is 1.5; allowed"),
+        (
+            lambda folder: tensor(folder, "mean.bias", 0, np.nan),
+            r"safetensors: weights 'mean.bias' are not fin",
+        ),
+        (lambda folder: tensor(folder, "mean.bias", ..., np.arange(7)), r"'mean.bias' are int64; allowed"),
+        (lambda folder: tensor(folder, "mean.bias", ..., np.full(7, 1e300)), r"'mean.bias' are not finite"),
     ],
 )
 def test_an_unusable_policy_is_refused_with_one_line_that_says_why(tmp_path, damage, message):
     saved(tmp_path / "p")
-    damage((tmp_path / "p").resolve())
+    damage(tmp_path / "p")
 
     with pytest.raises(PolicyError, match=message) as caught:
         load_policy(tmp_path / "p")
@@ -146,9 +222,31 @@ def edit(folder, key, value):
     (folder / CONTRACT_FILE).write_text(json.dumps(contract | {key: value}))
 
 
+def recoded(folder, encoding):
+    text = (folder / CONTRACT_FILE).read_text(encoding="utf-8")
+    (folder / CONTRACT_FILE).write_text(text, encoding=encoding)
+
+
+def tensor(folder, name, where, value):
+    """Change a tensor, or replace it where ``where`` is all of it."""
+    tensors = {key: array.copy() for key, array in load_file(folder / WEIGHTS_FILE).items()}
+    if where is ...:
+        tensors[name] = np.asarray(value)
+    else:
+        tensors[name][where] = value
+    save_file(tensors, folder / WEIGHTS_FILE)
+
+
+def test_a_contract_with_a_byte_order_mark_is_read(tmp_path):
+    saved(tmp_path / "p")
+    recoded(tmp_path / "p", "utf-8-sig")
+
+    assert load_policy(tmp_path / "p").contract == make_contract()
+
+
 def test_the_texts_of_a_layout_may_change(tmp_path):
     saved(tmp_path / "p")
-    folder = (tmp_path / "p").resolve()
+    folder = tmp_path / "p"
     contract = json.loads((folder / CONTRACT_FILE).read_text())
     contract["observation"][0]["meaning"] = "other words"
     (folder / CONTRACT_FILE).write_text(json.dumps(contract))
@@ -179,7 +277,7 @@ def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     (tmp_path / "default").mkdir()
 
-    assert names() == ["default", "paper"]
+    assert names() == ["all", "default", "paper"]
     assert policy_folder("default").resolve() == Path(__file__).parents[3] / "assets" / "policies" / "default"
     assert load_policy(policy_folder("default")).contract.task.robot == "rails"
     assert policy_folder("./default").resolve() == tmp_path / "default"

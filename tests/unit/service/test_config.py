@@ -128,7 +128,28 @@ def test_shared_settings_are_set_once(toml):
 
 
 def test_settings_of_other_services_are_ignored(toml):
-    assert load_learner(file=toml("[actor]\nenvs = 3"), TOPSPIN_ACTOR__ENVS="3", HOME="/") == Learner()
+    file = toml("[learner]\n[actor]\nenvs = 3")
+
+    assert load_learner(file=file, TOPSPIN_ACTOR__ENVS="3", HOME="/") == Learner()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "[learner]\nmax_lag = 1\n[play]\nvideo = 'x'",
+            r"\[play\] in .* is not used: learner reads \[task\], ",
+        ),
+        ("[actor]\nenvs = 3", r"nothing in .* is used: learner reads \[task\], \[learner\]; got actor"),
+        ("actors = 3", "nothing in .* is used: .*; got actors"),
+    ],
+)
+def test_a_given_file_that_is_not_for_this_program_is_an_error(toml, text, message):
+    file = toml(text)
+    with pytest.raises(ConfigError, match=message):
+        load_learner(file=file)
+
+    assert load_learner(TOPSPIN_CONFIG=file)  # one that all programs of a person share
 
 
 def test_the_file_may_be_named_by_the_environment(toml):

@@ -1,3 +1,4 @@
+import errno
 import logging
 import os
 import signal
@@ -55,6 +56,48 @@ def test_a_service_may_have_reported_errors_of_its_own(capsys):
 
     assert run_service("learner", raising(CheckpointError("checkpoint x is not readable"))) == 1
     assert capsys.readouterr().err == "learner: checkpoint x is not readable\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied", "runs/a"), "runs/a: Permission denied"),
+        (OSError(errno.EINVAL, "Invalid argument", "/mnt/x"), "/mnt/x: Invalid argument"),
+        (OSError(errno.ENOSPC, "No space left on device"), "No space left on device"),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), "Broken pipe"),
+        (MemoryError("Unable to allocate 9 TiB"), "Unable to allocate 9 TiB"),
+        (MemoryError(), "Cannot allocate memory"),
+    ],
+)
+def test_a_fault_of_the_machine_is_one_line_and_no_bug(capsys, caplog, error, line):
+    assert run_service("learner", raising(error)) == 1
+    assert capsys.readouterr().err == f"learner: {line}\n"
+    assert caplog.records == []
+
+
+DRAWS = """
+import sys
+from common.service.process import run_service
+def main(_stop):
+    from matplotlib.figure import Figure
+    Figure().savefig("/dev/null", format="png")
+    print("\u2713")
+    return 0
+sys.exit(run_service("p", main))
+"""
+
+
+def test_a_persons_environment_does_not_reach_our_programs():
+    done = subprocess.run(
+        [sys.executable, "-c", DRAWS],
+        env=os.environ
+        | {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "module://matplotlib_inline.backend_inline"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+    assert (done.returncode, done.stdout) == (0, "\\u2713\n"), done.stderr
 
 
 def test_help_goes_to_stdout_and_is_no_error(capsys):

@@ -5,7 +5,8 @@ import sys
 
 import pytest
 
-from common.service.run_folder import RunAliveError, RunFolder, whole_rows
+from common.service.run_folder import RunAliveError, RunFolder
+from common.service.table import whole_rows
 
 HOLD = """
 import subprocess, sys, time

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from common.policy.contract import PolicyError
-from common.policy.folder import load_policy, write_policy
+from common.policy.folder import load_policy, save_policy
 from tests.unit.evaluation.test_match import make_policy
 from topspin import release
 
@@ -20,7 +20,7 @@ def box(tmp_path, monkeypatch):
 
 def put_policy(folder):
     policy = make_policy()
-    write_policy(folder, policy.network, policy.moments, policy.contract)
+    save_policy(folder, policy.network, policy.moments, policy.contract)
     return policy
 
 

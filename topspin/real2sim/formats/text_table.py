@@ -1,9 +1,11 @@
 """Tables of text as named columns of numbers: encoding, delimiter, decimal comma, header, units and vector cells.
 
 The first line names the columns, in any case and order, unless the sidecar does (``columns``); other columns are
-ignored. The delimiter is the one of ``;``, tab, ``,`` and space that the first line has. Lines that are empty or start
-with ``#`` are skipped. An empty cell, ``nan``, ``NA``, ``null`` or ``inf`` is a missing value; any other text that is
-no number is an error. A name may have a unit, as in ``x [mm]``. A cell such as ``[1.2 0.1 0.25]`` holds three columns.
+ignored, and so is ``frame`` beside a time. The delimiter is the one of ``;``, tab, ``,`` and space that the first line
+has. Lines that are empty or start with ``#`` are skipped; but where the first line has numbers, a comment before it
+with as many names is the header, as ``numpy.savetxt`` writes it. An empty cell, ``nan``, ``NA``, ``null`` or ``inf`` is
+a missing value; any other text that is no number is an error. A name may have a unit, as in ``x [mm]``. A cell such as
+``[1.2 0.1 0.25]`` holds three columns.
 """
 
 import csv
@@ -29,8 +31,9 @@ VECTORS: Final = {
     "v": ("v", "vel", "velocity", "ball_vel", "ball_velocity", "twist_linear"),
     "w": ("w", "w_vel", "spin", "omega", "ball_spin", "angular_velocity", "twist_angular"),
 }
+COUNTER: Final = "frame"  # a time where the table has no other
 NAMES: Final = {
-    "t": ("t", "time", "timestamp", "timestamps", "time_stamp", "time_s", "frame", "stamp", "header_stamp"),
+    "t": ("t", "time", "timestamp", "timestamps", "time_stamp", "time_s", COUNTER, "stamp", "header_stamp"),
     "id": ("id", "track", "recording", "name"),
     "label": ("label", "type"),
     "player": ("player", "opponent"),
@@ -82,7 +85,8 @@ def read_table(path: Path, frame: Frame) -> Table:
             f"{path}: got an empty file; allowed: a line of column names and lines of numbers"
         )
     delimiter = next((mark for mark in DELIMITERS if mark in content[0][1].strip()), ",")
-    names, body = _header(path, frame, content, delimiter)
+    comments = [line for line in lines[: content[0][0] - 1] if line.strip()]
+    names, body = _header(path, frame, content, delimiter, comments)
     rows = [(n, _cells(line, delimiter)) for n, line in body]
     for n, cells in rows:
         if len(cells) != len(names):
@@ -116,14 +120,18 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def _header(path: Path, frame: Frame, content: Lines, delimiter: str) -> tuple[list[str], Lines]:
-    """Return the columns' names, by the sidecar or the first line, and the lines after them."""
+def _header(
+    path: Path, frame: Frame, content: Lines, delimiter: str, comments: list[str]
+) -> tuple[list[str], Lines]:
+    """Return the columns' names, by the sidecar, the first line or the comment before it, and the lines after them."""
     first = _cells(content[0][1], delimiter)
     is_header = not all(_NUMBER.fullmatch(cell) for cell in first if cell.lower() not in _MISSING)
     if frame.columns:
         return list(frame.columns), content[1:] if is_header else content
     if is_header:
         return first, content[1:]
+    if comments and len(named := _named(comments[-1])) == len(first):
+        return named, content
     header = HEADERS.get(len(first), "t;x;y;z, or the names of positions, velocities and spins")
     names = ", ".join(f'"{name}"' for name in header.split(";"))
     sidecar = path.with_suffix(".toml").name
@@ -134,6 +142,14 @@ def _header(path: Path, frame: Frame, content: Lines, delimiter: str) -> tuple[l
         f"{path}:{content[0][0]}: got numbers, no column names; add the first line "
         f"{header.replace(';', delimiter) if len(first) in HEADERS else header}{cure}"
     )
+
+
+def _named(comment: str) -> list[str]:
+    """Return the columns that a comment names; none where it is no header. Its delimiter may differ from the rows'."""
+    text = comment.strip().lstrip("#").strip()
+    names = _cells(text, next((mark for mark in DELIMITERS if mark in text), ","))
+    known = {alias for aliases in NAMES.values() for alias in aliases}
+    return names if any(_bare(name)[0] in known for name in names) else []
 
 
 def _without_vectors(
@@ -185,9 +201,13 @@ def _bare(name: str) -> tuple[str, str]:
 def _columns(names: list[str], where: str) -> dict[str, int]:
     """Return where each known column stands; raises RecordingError if a name appears twice or there is no position."""
     columns: dict[str, int] = {}
+    bare = [_bare(name)[0] for name in names]
+    has_time = any(name in NAMES["t"] and name != COUNTER for name in bare)
     for column, name in enumerate(names):
+        if bare[column] == COUNTER and has_time:
+            continue
         for known, aliases in NAMES.items():
-            if _bare(name)[0] in aliases:
+            if bare[column] in aliases:
                 if known in columns:
                     raise RecordingError(
                         f"{where}: {names[columns[known]]!r} and {name!r} are the same column"

@@ -1,4 +1,5 @@
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
@@ -279,6 +280,19 @@ def test_during_distillation_all_corrections_are_the_teachers(tmp_path, version)
         untaught = alone.play("a", 9, 3)
         assert (untaught.corrections != 0.0).any()
         np.testing.assert_array_equal(block.corrections, untaught.corrections)
+
+
+def test_a_teacher_that_is_gone_is_missed_only_while_it_teaches(tmp_path):
+    teacher = write_teacher(tmp_path / "t").model_copy(update={"epochs": 7})
+    shutil.rmtree(tmp_path / "t")
+    player = Player(CONFIG, ExperienceConfig(teacher=teacher), NETWORK, Dealer(), 4, HORIZON, 1)
+    weights = pack(new_network(NETWORK, OBSERVATION, player.env.home_action))
+    player.adopt(make_snapshot(player, version=6, weights=weights))
+    with pytest.raises(PolicyError, match=f"no policy .*{tmp_path / 't'}"):
+        player.play("a", 9, 3)
+    player.adopt(make_snapshot(player, version=7, weights=weights))
+
+    assert player.play("a", 9, 3).version == 7
 
 
 def test_play_needs_a_policy_first():

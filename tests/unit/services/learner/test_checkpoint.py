@@ -2,6 +2,8 @@
 
 import dataclasses
 import logging
+import os
+import shutil
 
 import numpy as np
 import pytest
@@ -76,3 +78,35 @@ def test_a_checkpoint_of_another_network_is_not_passed_over(tmp_path):
 
     with pytest.raises(CheckpointError, match="doesn't fit this configuration"):
         checkpoint.restore_newest(tmp_path, make_training(units=(4, 4)))
+
+
+def test_the_good_checkpoint_is_a_file_of_its_own_with_the_modes_of_the_umask(tmp_path):
+    before = os.umask(0o022)
+    try:
+        (path,) = saved(tmp_path, [7])
+        checkpoint.keep(path, tmp_path / "good")
+    finally:
+        os.umask(before)
+    (good,) = checkpoint.checkpoints(tmp_path / "good")
+
+    assert good.stat().st_nlink == path.stat().st_nlink == 1
+    assert oct(path.stat().st_mode & 0o777) == oct(good.stat().st_mode & 0o777) == "0o644"
+
+
+def test_a_run_copied_without_its_links_is_resumed(tmp_path):
+    path = saved(tmp_path / "run", [1, 2])[-1]
+    checkpoint.keep(path, tmp_path / "run" / "good")
+    shutil.copytree(tmp_path / "run", tmp_path / "copy")
+    training = make_training()
+    found, _ = checkpoint.restore_newest(tmp_path / "copy", training)
+    checkpoint.keep(checkpoint.save(tmp_path / "copy", training, EXTRAS), tmp_path / "copy" / "good")
+
+    assert found.name == path.name
+
+
+def test_a_checkpoint_that_can_not_be_read_says_why(tmp_path):
+    loop = tmp_path / "00000001.safetensors"
+    loop.symlink_to(loop.name)
+
+    with pytest.raises(CheckpointError, match=f"can't read checkpoint {loop}: Too many levels"):
+        checkpoint.restore_newest(tmp_path, make_training())

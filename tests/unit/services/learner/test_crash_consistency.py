@@ -10,8 +10,7 @@ from common.policy.actor_critic import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, save_policy
 from common.service.config import read_toml, save_settings
-from common.service.run_folder import whole_rows
-from common.service.table import Table
+from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.learner import checkpoint
@@ -126,7 +125,7 @@ def test_a_killed_resume_leaves_curve_settings_and_generation_whole(tmp_path, fo
     first = next_generation(template / ".generation", 0)
 
     def resume():
-        RunLog(folder / "metrics.csv", folder / "tb").truncate(30)
+        RunLog(folder / "metrics.csv", folder / "tb").truncate(30, 0)
         save_settings(folder / "config.toml", {"run": "new"})
         next_generation(folder / ".generation", 0)
 

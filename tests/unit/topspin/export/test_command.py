@@ -146,10 +146,10 @@ def test_leapp_runs_the_exported_pipeline(small):
 
 def test_the_command_says_what_it_wrote(small, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    from common.policy.folder import write_policy
+    from common.policy.folder import save_policy
 
     policy, _ = small
-    write_policy(
+    save_policy(
         tmp_path / "runs" / "night" / "policy" / "latest", policy.network, policy.moments, policy.contract
     )
     command.main(["--policy", "runs/night/policy/latest", "--out", "mine", "--json"], Event())

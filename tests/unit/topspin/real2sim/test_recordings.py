@@ -213,6 +213,23 @@ def test_a_velocity_of_another_moment_is_taken_back_to_the_positions(tmp_path, d
     assert np.linalg.norm(given - wanted) > 0.3
 
 
+@pytest.mark.parametrize("header", ["t,x,y,z", "t x y z", "Time; X [m]; Y [m]; Z [m]"])
+@pytest.mark.parametrize("delimiter", [",", " ", ";"])
+def test_a_header_that_numpy_writes_as_a_comment_names_the_columns(tmp_path, header, delimiter):
+    np.savetxt(tmp_path / "throw.csv", rows_of(TRACK), delimiter=delimiter, header=f"by a camera\n{header}")
+    (track,) = load(tmp_path / "throw.csv").tracks
+
+    np.testing.assert_array_equal(rows_of(track), rows_of(TRACK))
+
+
+@pytest.mark.parametrize("header", ["frame;t;x;y;z", "Frame;time;x;y;z"])
+def test_a_column_frame_beside_a_time_is_a_counter(tmp_path, header):
+    rows = np.column_stack([np.arange(len(TRACK.times)), rows_of(TRACK)])
+    (track,) = load(write_csv(tmp_path / "throw.csv", header, rows)).tracks
+
+    np.testing.assert_array_equal(rows_of(track), rows_of(TRACK))
+
+
 # ---- frames that can't be the file's
 
 
