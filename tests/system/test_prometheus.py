@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import urllib.error
 import urllib.parse
 import urllib.request
 from contextlib import closing, contextmanager
@@ -36,11 +37,11 @@ class Api:
         try:
             with urllib.request.urlopen(url, timeout=10) as answer:
                 return json.load(answer)["data"]
-        except ConnectionError:
-            return None
         except urllib.error.HTTPError as error:
+            if error.code == 503:  # it reads its files
+                return None
             raise AssertionError(f"{parameters}: {error.read().decode()}") from None
-        except urllib.error.URLError:  # it has not begun to listen
+        except OSError:  # it has not begun to listen
             return None
 
     def health(self):
