@@ -82,7 +82,7 @@ def one_line(folder, module, *arguments):
             TOPSPIN,
             "evaluate --policy nowhere",
             1,
-            "no policy 'nowhere'; allowed: a policy folder, or one of default, paper",
+            "no policy 'nowhere'; allowed: a policy folder, or one of all, default, paper",
         ),
         (
             TOPSPIN,
@@ -135,7 +135,7 @@ def test_unreadable_files_are_named_with_their_faults(tmp_path):
     (checkpoints / "00000001.safetensors").write_bytes(b"rubbish")
 
     assert (
-        "contract.json: observation: Field required"
+        "weights.safetensors is not readable as safetensors"
         in one_line(tmp_path, TOPSPIN, "evaluate", "--policy", policy)[1]
     )
     assert (

@@ -44,17 +44,17 @@ def generator(*argv: str) -> GeneratorConfig:
         (
             learner,
             ["--network.units", "64,0"],
-            "network.units = '0' (--network.units); allowed: list of a whole number, from 1",
+            "network.units = '0' (--network.units); allowed: list of a whole number, from 1 to 4096",
         ),
         (
             learner,
             ["--network.units", "-3,4"],
-            "network.units = '-3' (--network.units); allowed: list of a whole number, from 1",
+            "network.units = '-3' (--network.units); allowed: list of a whole number, from 1 to 4096",
         ),
         (
             learner,
             ["--network.units="],
-            "network.units = [] (--network.units); allowed: list of a whole number, from 1",
+            "network.units = [] (--network.units); allowed: list of a whole number, from 1 to 4096",
         ),
         (generator, ["--index", "1"], "generator: index 1; allowed: 0 to 0, of 1 generators"),
         (
