@@ -2,6 +2,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+# of the tests: the cores that this process may use, at most four
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 4 ? 4 : n)))
 STAMP := $(VENV)/.installed
 MINUTES ?=
 ACTORS ?= 1
@@ -36,10 +38,10 @@ report: $(STAMP)          ## compare runs: make report RUN="night other" [OUT=ru
 	$(BIN)/topspin report $(RUN) $(if $(OUT),--out $(OUT))
 
 test: $(STAMP)            ## all tests
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 test-fast: $(STAMP)       ## unit and contract tests
-	$(BIN)/python -m pytest tests/unit tests/contract -n auto --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest tests/unit tests/contract -n $(WORKERS) --dist worksteal
 
 check: $(STAMP)           ## format, lint, types, layers
 	$(BIN)/ruff format --check .
