@@ -78,7 +78,7 @@ def test_a_killed_actors_rollouts_are_accounted_for_and_the_others_train_on(tmp_
         victim, other = s.actor(0), s.actor(1)
         wait_until(lambda: victim.service.counts.accepted >= 4, 60, "some rollouts")
         s.cut_off(victim)
-        wait_until(lambda: learner.metric("topspin_alive", role="actor") == 1, 10, "the learner to notice")
+        wait_until(lambda: learner.metric("topspin_alive", service="actor") == 1, 10, "the learner to notice")
         epoch = progress(learner).epoch
         wait_until(lambda: progress(learner).epoch >= epoch + 4, 30, "training to go on")
         again = s.actor(0)

@@ -133,6 +133,7 @@ def test_unreadable_files_are_named_with_their_faults(tmp_path):
     checkpoints = tmp_path / "runs" / "r" / "checkpoints"
     checkpoints.mkdir(parents=True)
     (checkpoints / "00000001.safetensors").write_bytes(b"rubbish")
+    learner = (LEARNER, "--run", "r", "--endpoint", "tcp/127.0.0.1:17483")
 
     assert (
         "weights.safetensors is not readable as safetensors"
@@ -140,9 +141,9 @@ def test_unreadable_files_are_named_with_their_faults(tmp_path):
     )
     assert (
         "checkpoint runs/r/checkpoints/00000001.safetensors is not readable"
-        in (one_line(tmp_path, LEARNER, "--run", "r", "--resume")[1])
+        in (one_line(tmp_path, *learner, "--resume")[1])
     )
-    assert "go on with --resume, or choose another --run" in one_line(tmp_path, LEARNER, "--run", "r")[1]
+    assert "go on with --resume, or choose another --run" in one_line(tmp_path, *learner)[1]
 
 
 def test_a_run_is_not_started_again_by_accident(tmp_path):

@@ -164,7 +164,10 @@ def test_the_command_says_what_it_wrote(small, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("flags", "line"),
     [
-        (["--policy", "nowhere"], r"no policy 'nowhere'; allowed: a policy folder, or one of default, paper"),
+        (
+            ["--policy", "nowhere"],
+            r"no policy 'nowhere'; allowed: a policy folder, or one of all, default, paper",
+        ),
         (["--out", "full"], "full is not empty; allowed: a new or an empty folder"),
         (["--out", "file"], "file is no folder; allowed: a new or an empty folder"),
         (["--out", "file/in"], "can't write beside file/in"),
