@@ -25,6 +25,7 @@ import psutil
 from pydantic import Field
 from scipy.stats import theilslopes
 
+from benchmarks.running import check_learner, running
 from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
@@ -32,8 +33,7 @@ from common.service.log import set_up_logging
 from common.service.process import DONE
 from common.service.table import whole_rows
 from deploy.config import DeployConfig
-from deploy.prepare import PreparedRun, open_link, prepared
-from deploy.supervisor import Supervisor
+from deploy.prepare import PreparedRun, prepared
 
 log = logging.getLogger(__name__)
 
@@ -100,10 +100,7 @@ class SoakConfig(BenchmarkConfig):
 
 def watch(run: PreparedRun, config: SoakConfig, stop: Event) -> dict[str, Any]:
     """Return the figures of a run."""
-    supervisor = Supervisor(run.specs(), run.folder.logs)
-    transport = None
-    try:
-        transport = open_link(run, stop)
+    with running(run) as supervisor:
         series: dict[str, Series] = {}
 
         def work(seconds: float, samples: bool) -> None:
@@ -112,8 +109,7 @@ def watch(run: PreparedRun, config: SoakConfig, stop: Event) -> dict[str, Any]:
             while (now := time.monotonic()) < began + seconds:
                 check(stop)
                 supervisor.watch(now)
-                if supervisor.status_of("learner-0") is not None:
-                    raise ReportedError(f"the learner ended early: see {run.folder.logs / 'learner-0.log'}")
+                check_learner(run, supervisor)
                 if samples and now >= next_sample:
                     next_sample += config.interval
                     for name, child in supervisor.children.items():
@@ -137,11 +133,6 @@ def watch(run: PreparedRun, config: SoakConfig, stop: Event) -> dict[str, Any]:
         work(60.0 * config.minutes, samples=True)
         epochs = len(whole_rows(run.folder.metrics)) - before
         restarts = sum(child.restarts for child in supervisor.children.values())
-    finally:
-        supervisor.stop([name for name in supervisor.children if name != "learner-0"], 10.0)
-        supervisor.stop(["learner-0"], 30.0)
-        if transport is not None:
-            transport.close()
     return figures(series) | {"epochs": epochs, "restarts": restarts, "minutes": config.minutes}
 
 

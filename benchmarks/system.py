@@ -9,12 +9,14 @@ import os
 import shutil
 import sys
 import time
+from contextlib import closing
 from threading import Event
 from typing import Any
 
 import psutil
 from pydantic import Field
 
+from benchmarks.running import check_learner, running
 from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.comms.codec import decode
 from common.comms.keys import Keys
@@ -26,7 +28,6 @@ from common.service.run_folder import LATEST, RUNS
 from common.service.table import whole_rows
 from deploy.config import DeployConfig
 from deploy.prepare import PreparedRun, open_link, prepared
-from deploy.supervisor import Supervisor
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 
@@ -39,11 +40,8 @@ def cpu_seconds(processes: list[psutil.Process]) -> float:
 def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> dict[str, Any]:
     """Return the figures of a run."""
     folder = run.folder
-    supervisor = Supervisor(run.specs(), folder.logs)
-    transport = None
     learner: Status | None = None
-    try:
-        transport = open_link(run, stop)
+    with running(run) as supervisor, closing(open_link(run, stop)) as transport:
         statuses = transport.subscribe(Keys(run.name).every_status(), capacity=4096)
 
         def watch(until: float) -> None:
@@ -51,8 +49,7 @@ def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> 
             while time.monotonic() < until:
                 check(stop)
                 supervisor.watch(time.monotonic())
-                if supervisor.status_of("learner-0") is not None:
-                    raise ReportedError(f"the learner ended early: see {folder.logs / 'learner-0.log'}")
+                check_learner(run, supervisor)
                 for sample in statuses.poll():
                     status = decode(sample.payload, Status)
                     if status.role == "learner":
@@ -69,11 +66,6 @@ def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> 
         before, cpu_before, started = learner, cpu_seconds(processes), time.monotonic()
         watch(started + seconds)
         cpu, wall, after = cpu_seconds(processes) - cpu_before, time.monotonic() - started, learner
-    finally:
-        supervisor.stop([name for name in supervisor.children if name != "learner-0"], 10.0)
-        supervisor.stop(["learner-0"], 30.0)
-        if transport is not None:
-            transport.close()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     rows = whole_rows(folder.metrics)
     window = [

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import psutil
 
+from benchmarks.running import running
 from common.comms.codec import encode
 from common.comms.keys import Keys
 from common.comms.messages import ActorReport
@@ -20,7 +21,6 @@ from common.errors import ReportedError
 from common.evaluation.evaluate import check
 from deploy.config import DeployConfig
 from deploy.prepare import prepared
-from deploy.supervisor import Supervisor
 
 START_S: Final = 120.0
 EPOCHS: Final = 3  # after an attack, so that no rollout from before makes them all
@@ -87,16 +87,11 @@ class Victim:
         self._run = stack.enter_context(prepared(config))
         self.name, self.folder = self._run.name, self._run.folder
         self.link: ZenohConfig = self._run.link
-        self._supervisor = Supervisor(self._run.specs(), self.folder.logs)
-        stack.callback(self._end)
+        self._supervisor = stack.enter_context(running(self._run))
         self.wait(lambda: self.epochs() >= EPOCHS, START_S, f"training; see {self.folder.logs}")
         self._learner = psutil.Process(self._supervisor.children["learner-0"].process.pid)
         self._probe = stack.enter_context(beside(probe, self.link, self.name))
         self.stall_s()  # until the probe has its link
-
-    def _end(self) -> None:
-        self._supervisor.stop([name for name in self._supervisor.children if name != "learner-0"], 10.0)
-        self._supervisor.stop(["learner-0"], 30.0)
 
     def epochs(self) -> int:
         """Return how many epochs have been trained."""

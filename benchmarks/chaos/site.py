@@ -158,11 +158,12 @@ class Site:
 
     def start_router(self) -> None:
         """Start the router between ``routed`` and the hub."""
-        self.router = self.start("router", self.peer("router", self.routed))
+        flags = ["--endpoint", self.routed, "--peers", self.endpoint, "--metrics-port", "0"]
+        self.router = self.start("router", [sys.executable, "-m", "deploy.child", "deploy.router", *flags])
 
-    def peer(self, kind: str, *more: str) -> list[str]:
+    def peer(self, kind: str) -> list[str]:
         """Return the command of a peer of `benchmarks.chaos.peers`."""
-        return [sys.executable, "-m", "benchmarks.chaos.peers", kind, RUN, self.endpoint, *more]
+        return [sys.executable, "-m", "benchmarks.chaos.peers", kind, RUN, self.endpoint]
 
     def keep_up(self) -> None:
         """Start outside actors again that have ended, and say so if the run itself has."""

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from benchmarks.fuzz.message_examples import EXAMPLES
 from common.comms.codec import DecodeError, decode, encode
 from common.comms.messages import MESSAGES
 from common.policy.actor_critic import NetworkConfig
@@ -27,7 +28,6 @@ from services.learner.checkpoint import CheckpointError, Extras
 from services.learner.curriculum import CurriculumConfig
 from services.learner.ppo import PPOConfig
 from services.learner.training import Training
-from tests.unit.comms.message_examples import EXAMPLES
 from topspin.real2sim.formats.recordings import load
 from topspin.real2sim.formats.tracks import RecordingError
 

@@ -6,11 +6,11 @@ import pytest
 
 from benchmarks.attacker import OWN, Attacker
 from benchmarks.attacks import ATTACKS
+from benchmarks.fuzz.message_examples import EXAMPLES
 from common.comms.codec import DecodeError, decode
 from common.comms.keys import Keys
 from common.comms.messages import ActorReport, PolicySnapshot, Rollout
 from services.learner.admission import content_fault
-from tests.unit.comms.message_examples import EXAMPLES
 
 KEYS = Keys("night")
 POLICY = next(message for message in EXAMPLES if isinstance(message, PolicySnapshot))

@@ -8,11 +8,11 @@ import msgpack
 import pytest
 from hypothesis import given
 
+from benchmarks.fuzz.message_examples import EXAMPLES, make_rollout, make_verdict
 from common.comms.budgets import BUDGETS, CONTROL, KIB, LONGEST_TEXT, items_in, one_line
 from common.comms.codec import DecodeError, EncodeError, decode, encode
 from common.comms.messages import MESSAGES, ActorReport, Refusal, Rollout, Verdict, VerdictKind
 from services.learner.admission import open_rollout
-from tests.unit.comms.message_examples import EXAMPLES, make_rollout, make_verdict
 from tests.unit.comms.test_codec import JSONISH, sealed, with_field
 
 REPORT = next(example for example in EXAMPLES if isinstance(example, ActorReport))

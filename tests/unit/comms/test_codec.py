@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.fuzz.message_examples import EXAMPLES, make_rollout, make_stage, make_verdict
 from common.comms.budgets import one_line
 from common.comms.codec import DecodeError, EncodeError, decode, encode, salvage
 from common.comms.messages import (
@@ -21,7 +22,6 @@ from common.comms.messages import (
     VerdictKind,
 )
 from common.comms.wire import slots_of
-from tests.unit.comms.message_examples import EXAMPLES, make_rollout, make_stage, make_verdict
 
 JSONISH = st.recursive(
     st.none()

@@ -4,6 +4,7 @@ import json
 import msgpack
 import pytest
 
+from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, VerdictKind
 from services.actor.outbox import Flight, Outbox, OutboxConfig, report
@@ -19,7 +20,6 @@ from services.learner.intake import (
     IntakeConfig,
 )
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
-from tests.unit.comms.message_examples import make_rollout
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake
 from tests.unit.services.learner.rollouts import make_rollout as make_full_rollout

@@ -28,6 +28,7 @@ T, B, D, E = 3, 2, 5, 2
 
 
 def make_rollout(**changes: Any) -> Rollout:
+    """Return a rollout of three steps of two environments, with ``changes``."""
     rng = np.random.default_rng(1)
     truncated = np.zeros((T, B), bool)
     truncated[1, 0] = True
@@ -70,6 +71,7 @@ def make_rollout(**changes: Any) -> Rollout:
 
 
 def make_verdict(**changes: Any) -> Verdict:
+    """Return a verdict that accepts, with ``changes``."""
     verdict = Verdict(
         kind=VerdictKind.ACCEPTED,
         first=VerdictKind.ACCEPTED,
@@ -85,6 +87,7 @@ def make_verdict(**changes: Any) -> Verdict:
 
 
 def make_stage(number: int) -> StageChange:
+    """Return the stage change with a number."""
     return StageChange("night", 1, number, min(number + 1, 3), 1000 * number, 10 * number, "epochs")
 
 
