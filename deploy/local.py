@@ -198,8 +198,7 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
         log.warning("stopped before anything was learned; start again with: %s", again)
         return INTERRUPTED
     if status != DONE:
-        has_checkpoint = any(run.folder.checkpoints.glob("*.safetensors"))
-        advice = f"; go on with: {again}" if has_checkpoint else ""
+        advice = f"; go on with: {again}" if run.newest_checkpoint() else ""
         raise RunFailedError(
             f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}"
         )

@@ -48,6 +48,10 @@ class PreparedRun:
         """Return the last row of the run's metrics.csv; {} before anything is trained."""
         return last_epoch(self.folder)
 
+    def newest_checkpoint(self) -> str:
+        """Return the name of the newest checkpoint, or ""."""
+        return max((path.name for path in self.folder.checkpoints.glob("*.safetensors")), default="")
+
     def spent(self) -> str:
         """Return the limit that a resumed run had reached before, such as "10 of 10 minutes", or ""."""
         last = self.last_epoch()
@@ -68,17 +72,13 @@ class PreparedRun:
 
         def resumed() -> tuple[str, ...]:
             """Return the flag to go on from the newest checkpoint, if there is one."""
-            return ("--resume",) if any(self.folder.checkpoints.glob("*.safetensors")) else ()
-
-        def newest_checkpoint() -> str:
-            """Return the name of the newest checkpoint, or ""."""
-            return max((path.name for path in self.folder.checkpoints.glob("*.safetensors")), default="")
+            return ("--resume",) if self.newest_checkpoint() else ()
 
         # The learner holds the run's state: the run ends when it is done. A run that was stopped before its first
         # checkpoint starts from the beginning.
         learner, *workers = ROLES
         keeper = service(learner, 0, *(resumed() if config.resume else ()))
-        found = [replace(keeper, keeps_run=True, again=resumed, made=newest_checkpoint)]
+        found = [replace(keeper, keeps_run=True, again=resumed, made=self.newest_checkpoint)]
         found += [service(role, i) for role in workers for i in range(role.count(config))]
         return found
 

@@ -76,12 +76,7 @@ def whole_rows(file: Path) -> list[dict[str, str]]:
     content = read(file)
     for number, line in content.refused:
         if number < content.lines:
-            log.warning(
-                "refused: no row of numbers, one for each column file=%s line=%d text=%.60r",
-                file,
-                number,
-                line,
-            )
+            log.warning("%s file=%s line=%d text=%.60r", _REFUSED, file, number, line)
     return list(content.rows)
 
 

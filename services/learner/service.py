@@ -29,9 +29,10 @@ from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.divergence import NOT_FINITE
-from services.learner.generation import next_generation, yields
+from services.learner.generation import next_generation
 from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot, Ledger
+from services.learner.members import IDLE_WAIT_S, Members
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
 
@@ -40,17 +41,10 @@ log = logging.getLogger(__name__)
 ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
 REPORT_MAILBOX: Final = 256  # more than all actors of a run send at once
 SERVED_AT_ONCE: Final = 64  # messages of a kind read between two gradient steps
-IDLE_WAIT_S: Final = 0.2  # any arrival ends the wait
-NAMES_LOGGED: Final = 5  # of services that joined or left together
-TOKENS_ARRIVE_S: Final = 0.5  # longest time that the tokens of others take to arrive through a router
 
 
 class RunExistsError(ReportedError):
     """A new run would overwrite an old one's checkpoints."""
-
-
-class LearnerAliveError(ReportedError):
-    """The run has another learner."""
 
 
 class NotSavedError(ReportedError):
@@ -131,7 +125,6 @@ class LearnerService:
         if not config.resume:
             self._run_log.truncate(0, -1)  # rows of a process that ended before its first checkpoint
         self._intake = self._new_intake(extras)
-        self._alive: set[tuple[str, str, int]] = set()
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
         keys = self._keys = self._member.keys
         self._rollouts = transport.serve(keys.every_rollout(), capacity=ROLLOUT_MAILBOX)
@@ -144,18 +137,14 @@ class LearnerService:
         self._broadcast = Broadcast(
             transport, keys, self.training, identity, stages, config.evaluated_weights
         )
-        self._members = transport.watch_alive(keys.every_alive())
-        self._joined: float | None = None  # [s] time of its own token
-        self._rivals: set[int] = set()  # generations of other learners whose tokens stand
+        self._members = Members(config, transport, self._member, self._generation, self._intake, clock)
         self._has_nothing_left = False
         self._warned = False
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         # Without it, a learner that waits for its first actor would seem to have no checkpoint since 1970.
         metrics.set("topspin_checkpoint_time_seconds", time.time())
         telemetry.begin(metrics)
-        self._wait_for_predecessor()
-        self._member.join()
-        self._joined = clock()
+        self._members.join()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
         self._history = History(config.history, "learner-0")
@@ -388,43 +377,13 @@ class LearnerService:
         accounts = [AccountSnapshot.from_json(values) for values in extras.accounts]
         return Intake(self._intake_config, learner, accounts, queue, extras.closed)
 
-    def _wait_for_predecessor(self) -> None:
-        """Wait for the end of an earlier learner, whose token may stand for a moment after its death.
-
-        Raises:
-            LearnerAliveError: It lives on.
-        """
-        started = self._clock()
-        while True:
-            self._follow_members()
-            waited = self._clock() - started
-            patience = (
-                2.0 * self._config.lease_s if self._rivals else TOKENS_ARRIVE_S * self._may_be_elsewhere
-            )
-            if waited >= patience:
-                break
-            self._transport.wait(IDLE_WAIT_S)
-        if self._rivals:
-            raise LearnerAliveError(self._rival_text(max(self._rivals)))
-
-    @property
-    def _may_be_elsewhere(self) -> bool:
-        """Whether another learner may be at the same hub, or at one that is connected with it."""
-        return self._config.mode == "client" or bool(self._config.peers)
-
-    def _rival_text(self, generation: int) -> str:
-        return (
-            f"run {self._config.run!r} has another learner, generation {generation}, at the same hub: "
-            "end it first, or choose another --run"
-        )
-
     # ---- messages
 
     def _serve(self) -> None:
         """Answer waiting requests; also between gradient steps, so that no actor waits for an update."""
         now = self._clock()
         self._member.note_link(now)
-        self._follow_members()
+        self._members.follow()
         for misfit in self._intake.take_new_misfits():
             self._member.refuse(
                 "contract",
@@ -482,48 +441,12 @@ class LearnerService:
         except KeyPartError as error:
             return str(error)
 
-    def _follow_members(self) -> None:
-        """Record which services have joined or gone, and log it: one line however many they are."""
-        changes: dict[bool, list[str]] = {True: [], False: []}
-        for event in self._members.poll():
-            try:
-                member = self._keys.member(event.key)
-            except ValueError as error:  # KeyPartError, or digits that are no number
-                self._member.refuse("alive", error)
-                continue
-            if member.role == "learner":
-                self._meet(member.incarnation, event.alive)
-                continue
-            life = (member.role, member.id, member.incarnation)
-            changes[event.alive].append(f"{member.role}/{member.id}")
-            (self._alive.add if event.alive else self._alive.discard)(life)
-            if member.role == "actor":
-                (self._intake.seen if event.alive else self._intake.gone)(member.id, member.incarnation)
-        for is_alive, names in changes.items():
-            if names:
-                text = ", ".join(names[:NAMES_LOGGED]) + (" and others" if len(names) > NAMES_LOGGED else "")
-                log.info(
-                    "%s=%d %s; alive=%d", "joined" if is_alive else "gone", len(names), text, len(self._alive)
-                )
-
-    def _meet(self, generation: int, is_alive: bool) -> None:
-        """Note that the token of another learner of this run stands, or has ended."""
-        (self._rivals.add if is_alive else self._rivals.discard)(generation)
-        if not is_alive or self._joined is None:
-            return
-        text = self._rival_text(generation)
-        # A hub that starts sees no token before its own, and the others wait for its token
-        settling_s = 2.0 * TOKENS_ARRIVE_S * self._may_be_elsewhere
-        if yields(self._generation, generation, self._clock() - self._joined, settling_s):
-            raise LearnerAliveError(text)
-        log.error("%s; this one goes on, since it was first", text)
-
     def _warn_of_silence(self, now: float) -> None:
         since = max(self._clocks.last_trained, self._clocks.born)
         if self._warned or now - since < self._config.silence_warning_s:
             return
         self._warned = True
-        actors = sum(role == "actor" for role, _, _ in self._alive)
+        actors = self._members.roles.count("actor")
         if actors == 0:
             log.warning(
                 "waiting for=actors seconds=%.0f; start one with: python -m services.actor --run %s %s",
@@ -558,7 +481,7 @@ class LearnerService:
     def _beat(self) -> None:
         self._intake.tidy(self._clock())
         ledger, queued = self.ledger(), self._intake.queued
-        telemetry.measure_state(self._metrics, ledger, self._intake, (role for role, _, _ in self._alive))
+        telemetry.measure_state(self._metrics, ledger, self._intake, self._members.roles)
         counters, gauges = telemetry.heartbeat(
             self.training.progress,
             self._config.curriculum.epochs or 0,

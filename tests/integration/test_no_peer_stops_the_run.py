@@ -12,7 +12,8 @@ from common.comms.transport import Flow, Reply
 from common.task.config import TaskConfig
 from services.learner.config import LearnerConfig
 from services.learner.intake import IntakeConfig
-from services.learner.service import LearnerAliveError, LearnerService
+from services.learner.members import LearnerAliveError
+from services.learner.service import LearnerService
 from tests.integration.in_process_run import LONG, local_run, progress, wait_until
 
 KEYS = Keys("test")
