@@ -2,7 +2,9 @@
 
 import pytest
 
-from benchmarks.exchange import INVARIANTS, Bounds, explore
+from benchmarks.exchange.invariants import INVARIANTS
+from benchmarks.exchange.model import Bounds
+from benchmarks.exchange.search import explore
 from common.comms.messages import VerdictKind
 from services.learner import admission
 

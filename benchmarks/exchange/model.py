@@ -1,31 +1,16 @@
-"""Every state that two actors and a learner can reach together, within bounds, visited once.
+"""The model: a network that delays, repeats, reorders and loses messages, around the real outbox and intake.
 
-    python -m benchmarks.exchange --json
-
-The parts are the real ones: `services.actor.outbox` and `services.learner.intake`. Around them is a model of the rest:
-a network that delays, repeats, reorders and loses messages; a learner that trains, changes its stage, saves, dies and
-goes on from its checkpoint. In each state that is reached, every invariant of `INVARIANTS` is checked. A state from
-which no step leads on must be one in which both actors have played all that the bounds allow.
+The learner trains, changes its stage, saves, dies and goes on from its checkpoint.
 """
 
 import copyreg
 import pickle
-import sys
-import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from threading import Event
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final, cast
 
-from pydantic import Field
-
-from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.comms.messages import Rollout, Verdict
-from common.errors import ReportedError
-from common.evaluation.evaluate import check
-from common.service.process import DONE
 from services.actor import outbox as box
 from services.actor.outbox import Outbox, OutboxConfig
 from services.learner.admission import Header, LearnerState
@@ -38,7 +23,6 @@ INTAKE: Final = IntakeConfig(dataset_rollouts=2, max_lag=1, target_lag=1, queue_
 NEW_OUTBOX: Final = Outbox(OutboxConfig())
 STAGE_LENGTH: Final = 2  # versions of one stage
 CONTENT: Final = cast(Rollout, "content")  # no code under test reads it
-PROGRESS_S: Final = 5.0
 
 Name = tuple[str, int]  # actor, number
 
@@ -274,170 +258,3 @@ def _with_actor(state: State, index: int, actor: Actor) -> State:
     actors = list(state.actors)
     actors[index] = actor
     return replace(state, actors=tuple(actors))
-
-
-# ---- what holds in every state
-
-
-def _once(state: State, intake: Intake) -> bool:
-    return max(Counter(state.trained).values(), default=0) <= 1
-
-
-def _played(state: State, intake: Intake) -> bool:
-    return all(number < _of(state, name).outbox.next_sequence for name, number in state.trained)
-
-
-def _balances(state: State, intake: Intake) -> bool:
-    return intake.total().balance == 0 and all(actor.outbox.counts.balance == 0 for actor in state.actors)
-
-
-def _agrees(state: State, intake: Intake) -> bool:
-    """Both sides count as accepted what this learner accepted, once the actor knows."""
-    for index, actor in enumerate(state.actors):
-        given = {number for _, (name, number) in state.accepted if name == ACTORS[index]}
-        if actor.outbox.accepted > len(given):
-            return False
-    return True
-
-
-def _trained_as_recorded(state: State, intake: Intake) -> bool:
-    return intake.total().trained == len(state.trained)
-
-
-def _credits(state: State, intake: Intake) -> bool:
-    """No more is promised and waiting than the learner trains within its lag, and nobody holds more than a window."""
-    ahead = min(INTAKE.lag_aimed_at + 1, state.learner.datasets_left) * INTAKE.dataset_rollouts
-    return 0 <= intake._promised <= len(ACTORS) * INTAKE.window and intake.queued <= ahead + len(ACTORS)
-
-
-def _of(state: State, name: str) -> Actor:
-    return state.actors[ACTORS.index(name)]
-
-
-INVARIANTS: Final[Mapping[str, Callable[[State, Intake], bool]]] = {
-    "no rollout is in two kept epochs": _once,
-    "what is trained was played": _played,
-    "both ledgers balance": _balances,
-    "an actor counts as accepted only what a learner accepted": _agrees,
-    "the ledger counts as trained what is in kept epochs": _trained_as_recorded,
-    "credits stay within the windows, the queue within the lag": _credits,
-}
-
-
-def faults(state: State) -> list[str]:
-    """Return the invariants that do not hold in a state."""
-    intake: Intake = pickle.loads(state.intake)
-    return [name for name, holds in INVARIANTS.items() if not holds(state, intake)]
-
-
-def is_stuck(state: State, bounds: Bounds) -> bool:
-    """Return whether a state without a next step is one in which somebody waits for ever."""
-    played_all = all(actor.outbox.next_sequence >= bounds.rollouts for actor in state.actors)
-    return not played_all or any(actor.outbox.flights for actor in state.actors)
-
-
-@dataclass(slots=True)
-class Search:
-    """What a search has found."""
-
-    states: int = 0
-    steps: int = 0
-    ends: int = 0
-    depth: int = 0
-    is_whole: bool = True
-    kinds: Counter[str] = field(default_factory=Counter)
-    broken: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)  # invariant, and the path to it
-
-
-def explore(bounds: Bounds, most: int, stop: Event | None = None) -> Search:
-    """Visit every state within the bounds, nearest first, but at most ``most``."""
-    first = first_state()
-    came: dict[State, tuple[State, str] | None] = {first: None}
-    waiting = deque([(first, 0)])
-    found = Search()
-    told = time.monotonic()
-    while waiting:
-        state, depth = waiting.popleft()
-        next_ones = [(name, after) for name, after in steps(state, bounds) if after != state]
-        _note(found, state, depth, next_ones, bounds, came)
-        for name, after in next_ones:
-            if after in came:
-                continue
-            if len(came) >= most:
-                found.is_whole = False
-                break
-            came[after] = (state, name)
-            waiting.append((after, depth + 1))
-        if stop is not None:
-            check(stop)
-            if time.monotonic() - told > PROGRESS_S:
-                told = time.monotonic()
-                print(f"states={found.states} waiting={len(waiting)} depth={depth}", file=sys.stderr)
-    return found
-
-
-def _note(
-    found: Search,
-    state: State,
-    depth: int,
-    next_ones: Sequence[tuple[str, State]],
-    bounds: Bounds,
-    came: Mapping[State, tuple[State, str] | None],
-) -> None:
-    """Count a state, and check it."""
-    found.states += 1
-    found.depth = max(found.depth, depth)
-    found.steps += len(next_ones)
-    found.kinds.update(name for name, _ in next_ones)
-    broken = faults(state)
-    if not next_ones:
-        found.ends += 1
-        if is_stuck(state, bounds):
-            broken.append("nobody waits for ever")
-    found.broken += [(fault, path_to(state, came)) for fault in broken]
-
-
-def path_to(state: State, came: Mapping[State, tuple[State, str] | None]) -> tuple[str, ...]:
-    """Return the steps that lead to a state."""
-    names: list[str] = []
-    while (before := came[state]) is not None:
-        state, name = before
-        names.append(name)
-    return tuple(reversed(names))
-
-
-class ExchangeConfig(BenchmarkConfig):
-    """Visit every state of the exchange of rollouts, credits, generations and stages within bounds."""
-
-    rollouts: int = Field(2, ge=1, le=8, description="that each of two actors plays")
-    losses: int = Field(1, ge=0, le=4, description="messages that are lost or late, on one path")
-    repeats: int = Field(1, ge=0, le=4, description="messages that arrive twice, on one path")
-    deaths: int = Field(1, ge=0, le=4, description="deaths of the learner, on one path")
-    states: int = Field(200_000, ge=1, description="states that are visited at most")
-
-
-def main(config: ExchangeConfig, stop: Event) -> int:
-    """Search and print; a broken invariant ends with its shortest path."""
-    bounds = Bounds(config.rollouts, config.losses, config.repeats, config.deaths)
-    found = explore(bounds, config.states, stop)
-    print_figures(
-        {
-            "states": found.states,
-            "steps": found.steps,
-            "ends": found.ends,
-            "depth": found.depth,
-            "whole": found.is_whole,
-            "invariants": len(INVARIANTS) + 1,
-            "broken": len(found.broken),
-            "steps_by_kind": dict(found.kinds),
-        },
-        config.json_line,
-    )
-    if found.broken:
-        invariant, path = min(found.broken, key=lambda one: len(one[1]))
-        raise ReportedError(f"not true: {invariant}; shortest path: {', '.join(path)}")
-    return DONE
-
-
-if __name__ == "__main__":
-    sys.exit(run("exchange", ExchangeConfig, main))
