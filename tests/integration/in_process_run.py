@@ -3,7 +3,6 @@
 import re
 import socket
 import threading
-import time
 import urllib.request
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -42,13 +41,6 @@ def free_endpoint():
 def progress(learner):
     """Return how far a learner in this process has trained."""
     return learner.service.training.progress
-
-
-def wait_until(condition, timeout_s, what):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
-        time.sleep(0.02)
 
 
 @dataclass

@@ -12,9 +12,10 @@ from common.comms.transport import Flow, NoReply
 from common.policy.weights import load_tensors, save_tensors
 from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION
-from tests.integration.in_process_run import CURRICULUM, local_run, wait_until
+from tests.integration.in_process_run import CURRICULUM, local_run
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.learner.rollouts import make_rollout
+from tests.waiting import wait_until
 
 KEYS = Keys("test")
 REPORT = ActorReport("test", "client", 1, 0, 0, (), (), 0, (), leaving=False)
@@ -31,7 +32,7 @@ class ForeignClient:
 
     def policy(self):
         return decode(
-            self.transport.request(KEYS.policy(), b"", 5.0, Flow.POLICY).wait().payload, PolicySnapshot
+            self.transport.request(KEYS.policy(), b"", 60.0, Flow.POLICY).wait().payload, PolicySnapshot
         )
 
     def rollout(self, **changes):
@@ -43,7 +44,7 @@ class ForeignClient:
         return make_rollout(**(values | changes))
 
     def send(self, payload, key=None):
-        return self.transport.request(key or KEYS.rollout(self.name), payload, 5.0, Flow.ROLLOUT).wait()
+        return self.transport.request(key or KEYS.rollout(self.name), payload, 60.0, Flow.ROLLOUT).wait()
 
     def verdict(self, payload):
         return decode(self.send(payload).payload, Verdict)
@@ -186,7 +187,7 @@ def test_workers_refuse_bad_messages_and_play_on(tmp_path):
         publish(KEYS.stage(), b"nonsense", Flow.STAGE)
         publish(KEYS.stage(), encode(StageChange("test", 1, 50, 3, 0, 0, "wrong")), Flow.STAGE)
         for role in ("actor", "evaluator", "generator"):
-            assert request(KEYS.ctl(role, "0"), b"nonsense", 5.0, Flow.CONTROL).wait() is NoReply.NO_SERVER
+            assert request(KEYS.ctl(role, "0"), b"nonsense", 60.0, Flow.CONTROL).wait() is NoReply.NO_SERVER
         request(KEYS.rally(0), b"nonsense", 5.0, Flow.RALLY).wait()
         wait_until(lambda: refused(actor, "stage") == 1, 10, "the actor to refuse a stage")
         for payload in (

@@ -19,7 +19,8 @@ from services.actor.rally_feed import NoRalliesError
 from services.learner.checkpoint import CheckpointError
 from services.learner.intake import IntakeConfig
 from services.learner.service import RunExistsError
-from tests.integration.in_process_run import CURRICULUM, LONG, free_endpoint, local_run, progress, wait_until
+from tests.integration.in_process_run import CURRICULUM, LONG, free_endpoint, local_run, progress
+from tests.waiting import wait_until
 
 SYNCHRONOUS = {"intake": IntakeConfig(dataset_rollouts=2, max_lag=0)}
 

@@ -7,7 +7,8 @@ import pytest
 from services.learner import checkpoint
 from services.learner.service import NotSavedError
 from tests.full_disk import files_up_to
-from tests.integration.in_process_run import LONG, local_run, progress, wait_until
+from tests.integration.in_process_run import LONG, local_run, progress
+from tests.waiting import wait_until
 
 LIMIT = 16_384  # bytes of a file: less than a checkpoint
 

@@ -14,7 +14,8 @@ from services.learner.config import LearnerConfig
 from services.learner.intake import IntakeConfig
 from services.learner.members import LearnerAliveError
 from services.learner.service import LearnerService
-from tests.integration.in_process_run import LONG, local_run, progress, wait_until
+from tests.integration.in_process_run import LONG, local_run, progress
+from tests.waiting import wait_until
 
 KEYS = Keys("test")
 ONE = {"intake": IntakeConfig(dataset_rollouts=1), "curriculum": LONG}

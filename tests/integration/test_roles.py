@@ -14,7 +14,7 @@ from common.comms.transport import TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from deploy.prepare import free_endpoint
-from tests.integration.in_process_run import wait_until
+from tests.waiting import wait_until
 
 KEYS = Keys("r")
 NAMES = ("learner-0", "actor-0", "generator-0", "evaluator-0", "operator-0")

@@ -9,7 +9,8 @@ from safetensors.numpy import load_file
 
 from services.learner.checkpoint import checkpoints
 from services.learner.service import DivergedError
-from tests.integration.in_process_run import LONG, local_run, progress, wait_until
+from tests.integration.in_process_run import LONG, local_run, progress
+from tests.waiting import wait_until
 
 
 def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):

@@ -4,7 +4,8 @@ from contextlib import contextmanager
 from threading import Event, Thread
 
 from deploy.router import main
-from tests.integration.in_process_run import LONG, free_endpoint, local_run, progress, wait_until
+from tests.integration.in_process_run import LONG, free_endpoint, local_run, progress
+from tests.waiting import wait_until
 
 
 @contextmanager

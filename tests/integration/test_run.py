@@ -10,8 +10,9 @@ import torch
 from common.policy.folder import load_policy
 from common.task.experience import ExperienceConfig
 from services.learner.curriculum import CurriculumConfig
-from tests.integration.in_process_run import CURRICULUM, PPO, local_run, wait_until
+from tests.integration.in_process_run import CURRICULUM, PPO, local_run
 from tests.unit.env.teachers import write_teacher
+from tests.waiting import wait_until
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")
 

@@ -22,14 +22,6 @@ TINY = [
 STAGES = ["--learner.curriculum.stage-1", "3", "--learner.curriculum.stage-2", "2"]
 
 
-def wait_until(condition, timeout_s, what):
-    deadline = time.monotonic() + timeout_s
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"waited {timeout_s} s for {what}"
-        time.sleep(0.05)
-    return found
-
-
 @dataclass
 class Command:
     """A running command; its outputs go to files."""

@@ -7,7 +7,8 @@ import pytest
 
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from tests.system.commands import TINY, run, running, wait_until
+from tests.system.commands import TINY, run, running
+from tests.waiting import wait_until
 
 DEPLOY, LEARNER, ACTOR, TOPSPIN = ("deploy.local", "services.learner", "services.actor", "topspin")
 

@@ -11,7 +11,8 @@ from threading import Event
 import pytest
 
 from common.policy.folder import load_policy
-from tests.system.commands import STAGES, TINY, children_of, last_json, run, running, wait_until
+from tests.system.commands import STAGES, TINY, children_of, last_json, run, running
+from tests.waiting import wait_until
 from topspin.certs import main
 
 FATES = ("trained", "refused", "dropped", "in_flight", "lost")

@@ -16,13 +16,7 @@ from deploy.supervisor import (
     next_start,
     restart_pause,
 )
-
-
-def wait_until(condition, timeout_s=20.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+from tests.waiting import wait_until
 
 
 def test_pauses_before_restarts_double_up_to_a_bound():
