@@ -2,6 +2,9 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+LOCK := $(BIN)/uv pip compile pyproject.toml requirements/beside.in --override requirements/without-torch.txt --upgrade \
+	--no-emit-package torch --universal --python-version 3.11 --generate-hashes --no-header --quiet
 # of the tests: the cores that this process may use, at most four
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 4 ? 4 : n)))
 STAMP := $(VENV)/.installed
@@ -12,16 +15,18 @@ POLICY ?=
 VIDEO ?=
 OUT ?=
 
-.PHONY: help install train play pictures report test test-fast check fix bench bench-guard docs clean
+.PHONY: help install train play pictures report test test-fast check fix bench bench-guard docs lock audit release clean
 
 help:                     ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
 
 install: $(STAMP)         ## make .venv with everything in it, and compile the kernels
 
-$(STAMP): pyproject.toml
+# the lock names every package but torch, which the second line brings
+$(STAMP): pyproject.toml requirements/dev.lock
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(PIP) install --require-hashes --no-deps --requirement requirements/dev.lock
+	$(PIP) install --no-build-isolation --editable '.[dev]'
 	$(BIN)/python -m topspin.compile_kernels
 	@touch $(STAMP)
 
@@ -67,6 +72,20 @@ bench-guard: $(STAMP)     ## fail where a part is much slower against its limit 
 
 docs: $(STAMP)            ## the documentation as pages: build/site/index.html
 	$(BIN)/mkdocs build --strict --quiet
+
+lock:                     ## lock the newest allowed releases of all dependencies (after make install)
+	$(LOCK) --extra dev --output-file requirements/dev.lock
+	$(LOCK) --output-file requirements/services.lock
+
+audit: $(STAMP)           ## ask for known vulnerabilities of the locked dependencies
+	$(BIN)/pip-audit --disable-pip --require-hashes --requirement requirements/dev.lock
+
+release: $(STAMP)         ## sdist, wheel, bill of materials and checksums: build/release
+	rm -rf build/release
+	$(BIN)/python -m build --no-isolation --outdir build/release .
+	(cat requirements/services.lock; sed -n 's/.*"\(torch==.*\)".*/\1/p' pyproject.toml) | $(BIN)/cyclonedx-py requirements - \
+		--pyproject pyproject.toml --output-reproducible --of JSON --output-file build/release/topspin.cdx.json
+	cd build/release && sha256sum * > SHA256SUMS
 
 clean:                    ## remove the environment and caches, not the runs
 	rm -rf $(VENV) .numba_cache .pytest_cache .mypy_cache .ruff_cache .hypothesis build *.egg-info
