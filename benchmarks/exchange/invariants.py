@@ -37,7 +37,9 @@ def _trained_as_recorded(state: State, intake: Intake) -> bool:
 def _credits(state: State, intake: Intake) -> bool:
     """No more is promised and waiting than the learner trains within its lag, and nobody holds more than a window."""
     ahead = min(INTAKE.lag_aimed_at + 1, state.learner.datasets_left) * INTAKE.dataset_rollouts
-    return 0 <= intake._promised <= len(ACTORS) * INTAKE.window and intake.queued <= ahead + len(ACTORS)
+    return 0 <= intake._credits._promised <= len(ACTORS) * INTAKE.window and intake.queued <= ahead + len(
+        ACTORS
+    )
 
 
 def _of(state: State, name: str) -> Actor:

@@ -3,15 +3,8 @@
 It has state, but no network and no clock of its own, and it reads no array of a rollout.
 
 Lag is counted to the version at use: each dataset queued before a rollout, and a running update, raise it by one. So an
-accepted rollout never becomes too old while it waits.
-
-Pacing: every verdict carries the number below which its actor may publish. The limits add up to the rollouts that are
-still needed of the present version. So actors pause instead of playing rollouts that would be refused, which would
-favour short episodes. An actor without credits reports until it gets some, so that no grant is lost for good.
-
-No actor can hold the credits that others need (ADR-0046). Only an actor with the learner's contract gets any. Those
-that bring no new rollout for `credit_patience_s` count as free, whoever holds them. An actor whose rollouts are refused
-again and again pauses. The cost of a report does not depend on the number of accounts: all sums are kept up to date.
+accepted rollout never becomes too old while it waits. An actor without credits reports until it gets some, so that no
+grant is lost for good.
 """
 
 from collections import deque
@@ -23,8 +16,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.comms.budgets import one_line
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
+from services.learner.accounts import Accounts, Life
 from services.learner.admission import Case, Header, LearnerState, differs, judge
-from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, Outcome, folded, restored
+from services.learner.credits import Credits
+from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, Outcome
 
 # These are not recorded: the rollout has a verdict, or its actor sends it again.
 _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
@@ -32,18 +27,6 @@ _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
 IDLE_REPORTS_HZ: Final = 16.0  # reports of all waiting actors together: 2 % of a core (benchmarks.idle)
 SOONEST_REPORT_S: Final = 0.25  # pause between reports of a small fleet
 LATEST_REPORT_S: Final = 64.0  # of one of more than 1,000 actors
-FREE_REFUSALS: Final = 2  # in a row: a stage change or a restart costs an actor as many as it has in flight
-LONGEST_PAUSE_S: Final = 60.0  # without credits, after many refusals in a row
-FOLD_AFTER_S: Final = 600.0  # a life that a newer one of the same actor has replaced
-FOLD_LAST_AFTER_S: Final = 86_400.0  # the last life of an actor: by then it has dropped what it had in flight
-MOST_ACCOUNTS: Final = 16_384  # a new one beyond closes a dead one early, or is refused
-LIVES_KEPT: Final = 4096  # closed lives whose late messages are told from those of new ones
-
-# How far the numbers of a known life may go on in one message
-BEYOND_CREDITS: Final = 64  # more than any window: from what this learner granted
-LONGEST_JUMP: Final = 65_536  # more than any outage takes: from what an earlier learner may have granted
-
-EARLIER: Final = ("", 0)  # the account of all closed lives
 
 
 class IntakeConfig(BaseModel):
@@ -107,9 +90,6 @@ class Misfit:
     training_hash: str
 
 
-_Key = tuple[str, int]  # actor, incarnation
-
-
 class Intake:
     """The learner's side of every rollout, from its arrival to its update.
 
@@ -127,43 +107,20 @@ class Intake:
         learner: LearnerState,
         snapshots: Iterable[AccountSnapshot] = (),
         queue: Iterable[Queued] = (),
-        closed: Iterable[tuple[str, int]] = (),
+        closed: Iterable[Life] = (),
     ) -> None:
         self._config = config.for_actors(1)  # a size that is not worked out yet is one actor's
         self._learner_state = learner
         self._queue: deque[Queued] = deque(queue)
-        kept: dict[_Key, set[int]] = {}
+        kept: dict[Life, set[int]] = {}
         for entry in self._queue:
             kept.setdefault(entry.header.life, set()).add(entry.header.sequence)
-        self._accounts: dict[_Key, Account] = {}
+        self._accounts = Accounts(snapshots, kept, closed)
+        self._credits = Credits(config.window, config.credit_patience_s)
         self._in_update: tuple[Queued, ...] = ()
         self._now = 0.0
-        self._closed = dict.fromkeys(closed)  # in order of closing
-        # Sums over all accounts, kept up to date
-        self._total = Ledger()
-        self._gaps = 0
-        # Each account's changes at the last sum, and its parts of total and gaps
-        self._summed: dict[_Key, tuple[int, Ledger, int]] = {}
-        self._changed: set[_Key] = set()
-        self._promised = 0
-        self._holders: dict[_Key, int] = {}  # each one's part of it, by the time of its last progress
-        self._living: set[_Key] = set()
-        self._misfits: dict[_Key, Misfit] = {}
+        self._misfits: dict[Life, Misfit] = {}
         self._new_misfits: list[Misfit] = []
-        self._newest: dict[str, int] = {}  # the life of each actor that was heard of last
-        self._dead_since: dict[_Key, float] = {}  # [s], oldest first
-        self._awaited: dict[_Key, float] = {}  # accounts of a checkpoint, until their actors are heard
-        for memory in snapshots:
-            key = (memory.actor, memory.incarnation)
-            self._accounts[key] = restored(memory, kept.get(key, frozenset()))
-            if key == EARLIER:
-                self._accounts[key].is_alive = False
-            else:
-                self._awaited[key] = -1.0
-            self._newest[key[0]] = key[1]
-            self._changed.add(key)
-        for key in kept.keys() - self._accounts.keys():
-            raise ValueError(f"{len(kept[key])} rollouts wait of {key}, which has no account")
         for entry in list(self._queue):
             self._drop_unfit(entry)
 
@@ -183,9 +140,9 @@ class Intake:
         return tuple(self._queue)
 
     @property
-    def closed(self) -> tuple[tuple[str, int], ...]:
+    def closed(self) -> tuple[Life, ...]:
         """Closed lives of actors, for a checkpoint."""
-        return tuple(self._closed)
+        return self._accounts.closed
 
     @property
     def misfits(self) -> tuple[Misfit, ...]:
@@ -195,7 +152,7 @@ class Intake:
     @property
     def report_after_s(self) -> float:
         """Pause between two reports of a waiting actor [s]: all together send `IDLE_REPORTS_HZ`."""
-        return min(max(SOONEST_REPORT_S, len(self._living) / IDLE_REPORTS_HZ), LATEST_REPORT_S)
+        return min(max(SOONEST_REPORT_S, self._accounts.living / IDLE_REPORTS_HZ), LATEST_REPORT_S)
 
     def take_new_misfits(self) -> list[Misfit]:
         """Return the misfits that were found since the last call, each life of an actor once."""
@@ -226,29 +183,25 @@ class Intake:
         if kind is VerdictKind.WRONG_RUN:
             # An actor of another run may have the name of one of ours: no account here
             return self._verdict(kind, kind, reason)
-        key = header.life
-        if self._is_closed(key):
-            return self._verdict(VerdictKind.INVALID, VerdictKind.INVALID, _closed_reason(key))
-        if fault := self._jump_fault(key, header.sequence) or self._no_room(key):
+        life = header.life
+        if fault := self._fault(life, header.sequence):
             return self._verdict(VerdictKind.INVALID, VerdictKind.INVALID, fault)
-        account = self._account(key)
-        self._note_contract(key, account, header.training_hash)
+        account = self._accounts.open(life)
+        self._note_contract(account, header.training_hash)
         if kind is VerdictKind.ACCEPTED:
             if rollout is None:
                 raise ValueError("a rollout without content needs a fault in its header")
             account.settle(header.sequence, Fate.QUEUED)
             self._queue.append(Queued(header, rollout))
             account.refused_in_a_row = 0
-            self._progress(key, account)
+            self._credits.note_progress(account, now)
         elif kind not in _UNRECORDED:
             account.settle(header.sequence, kind)
-            account.refused_in_a_row += 1
-            account.no_credits_before = now + pause_after(account.refused_in_a_row)
-            self._progress(key, account)
+            self._credits.note_refusal(account, now)
         first: VerdictKind = kind
         if kind is VerdictKind.DUPLICATE:
             first = known if isinstance(known, VerdictKind) else VerdictKind.ACCEPTED
-        self._grant(key, account)
+        self._credits.grant(account, self._wanted(), now)
         return self._verdict(kind, first, reason, account.credit_limit)
 
     def unreadable(self, reason: str) -> Verdict:
@@ -263,58 +216,42 @@ class Intake:
         """
         self._now = now
         learner = self._learner_state
-        key = (report.actor, report.incarnation)
-        fault = (
-            differs("run", report.run, learner.run)
-            or (_closed_reason(key) if self._is_closed(key) else "")
-            or self._jump_fault(key, report.published)
-            or self._no_room(key)
-        )
-        if fault:
+        life = (report.actor, report.incarnation)
+        if fault := differs("run", report.run, learner.run) or self._fault(life, report.published):
             return self._verdict(VerdictKind.WRONG_RUN, VerdictKind.WRONG_RUN, fault)
-        account = self._account(key)
+        account = self._accounts.open(life)
         account.hear(report, learner.generation)
-        self._set_alive(key, account, not (report.leaving or account.is_out_of_sight))
-        self._note_contract(key, account, report.training_hash)
-        self._grant(key, account)
+        self._set_alive(life, not (report.leaving or account.is_out_of_sight))
+        self._note_contract(account, report.training_hash)
+        self._credits.grant(account, self._wanted(), now)
         misfit = differs("training", report.training_hash or "of an older release", learner.training_hash)
         kind = VerdictKind.WRONG_CONTRACT if misfit else VerdictKind.CREDITS
         return self._verdict(kind, kind, misfit, account.credit_limit)
 
     def gone(self, actor: str, incarnation: int) -> None:
         """Record that an actor died or left: its rollouts in flight are lost, its credits are free."""
-        key = (actor, incarnation)
-        if self._is_closed(key) or self._no_room(key):
+        life = (actor, incarnation)
+        if self._accounts.is_closed(life) or self._accounts.make_room(life):
             return
-        account = self._account(key)
-        account.is_out_of_sight = True
-        self._set_alive(key, account, False)
+        self._accounts.open(life).is_out_of_sight = True
+        self._set_alive(life, False)
 
     def seen(self, actor: str, incarnation: int) -> None:
         """Record that an actor's token is present: after a loss, its rollouts in flight may arrive again."""
         account = self._accounts.get((actor, incarnation))
         if account is not None and account.is_out_of_sight:
             account.is_out_of_sight = False
-            self._set_alive((actor, incarnation), account, True)
+            self._set_alive((actor, incarnation), True)
 
     def tidy(self, now: float) -> None:
-        """Close the accounts of lives that ended long ago: their counts go to one account of all earlier lives.
+        """Close the accounts of lives that ended long ago.
 
         An actor of a checkpoint that is not heard for `credit_patience_s` is dead.
         """
         self._now = now
-        for key, since in list(self._awaited.items()):
-            if since < 0:
-                self._awaited[key] = now
-            elif now - since > self._config.credit_patience_s:
-                self._set_alive(key, self._accounts[key], False)
-        for key, since in list(self._dead_since.items()):
-            if now - since <= FOLD_AFTER_S:
-                break
-            is_replaced = self._newest.get(key[0]) != key[1]  # no clock says which life is newer
-            if self._accounts[key].queued or not (is_replaced or now - since > FOLD_LAST_AFTER_S):
-                continue
-            self._close(key)
+        for life in self._accounts.overdue(now, self._config.credit_patience_s):
+            self._set_alive(life, False)
+        self._accounts.close_old(now)
 
     def take_dataset(self) -> tuple[Queued, ...]:
         """Return the rollouts of the next dataset, oldest first, and start its update; () while too few wait.
@@ -348,116 +285,49 @@ class Intake:
                 lost.append(entry)
         return tuple(lost)
 
-    def ledgers(self) -> dict[tuple[str, int], Ledger]:
-        """Return the account of every (actor, incarnation)."""
-        return {key: account.ledger() for key, account in self._accounts.items()}
+    def ledgers(self) -> dict[Life, Ledger]:
+        """Return the ledger of every life of every actor."""
+        return self._accounts.ledgers()
 
     def total(self) -> Ledger:
-        """Return the ledger of all accounts together; only those that have changed are read."""
-        for key in self._changed:
-            account = self._accounts.get(key)
-            changes, before, gaps = self._summed.pop(key, (-1, Ledger(), 0))
-            if account is None:
-                self._total, self._gaps = self._total - before, self._gaps - gaps
-                continue
-            if changes != account.changes:
-                after = account.ledger()
-                self._total, self._gaps = self._total - before + after, self._gaps - gaps + account.gaps
-                changes, before, gaps = account.changes, after, account.gaps
-            self._summed[key] = (changes, before, gaps)
-        self._changed.clear()
-        return self._total
+        """Return the ledger of all accounts together."""
+        return self._accounts.total()
 
     def gaps(self) -> int:
         """Return how many sequence numbers are missing below the highest that arrived, over all actors."""
-        self.total()
-        return self._gaps
+        return self._accounts.gaps()
 
     def snapshots(self) -> tuple[AccountSnapshot, ...]:
         """Return what a checkpoint keeps, so that the next learner can tell a retry from a new rollout."""
-        return tuple(account.snapshot() for account in self._accounts.values())
+        return self._accounts.snapshots()
 
-    # ---- accounts
+    # ---- actors
 
-    def _account(self, key: _Key) -> Account:
-        """Return the account of one life of an actor, which has sent a message or lost its token."""
-        self._awaited.pop(key, None)
-        self._changed.add(key)
-        if key not in self._accounts:
-            self._accounts[key] = Account(*key)
-            self._newest[key[0]] = key[1]
-        account = self._accounts[key]
-        if account.is_alive:
-            self._living.add(key)
-        return account
+    def _fault(self, life: Life, number: int) -> str:
+        """Return why a message of this life with this number counts for nothing, or ""."""
+        accounts = self._accounts
+        return accounts.closed_reason(life) or accounts.jump_reason(life, number) or accounts.make_room(life)
 
-    def _set_alive(self, key: _Key, account: Account, is_alive: bool) -> None:
-        self._awaited.pop(key, None)
-        self._changed.add(key)
-        account.is_alive = is_alive
-        if is_alive:
-            self._living.add(key)
-            self._dead_since.pop(key, None)
-        else:
-            self._living.discard(key)
-            self._misfits.pop(key, None)
-            self._dead_since.setdefault(key, self._now)
-        self._recount(key, account)
+    def _set_alive(self, life: Life, is_alive: bool) -> None:
+        account = self._accounts.set_alive(life, is_alive, self._now)
+        if not is_alive:
+            self._misfits.pop(life, None)
+        self._credits.recount(account, self._now)
 
-    def _is_closed(self, key: _Key) -> bool:
-        return key in self._closed
-
-    def _no_room(self, key: _Key) -> str:
-        """Return why a new life gets no account, or ""; a dead one's is closed for it."""
-        if key in self._accounts or len(self._accounts) < MOST_ACCOUNTS:
-            return ""
-        dead = next((old for old in self._dead_since if not self._accounts[old].queued), None)
-        if dead is None:
-            return f"actor {key[0]} is one too many; allowed: {MOST_ACCOUNTS} with an account"
-        self._close(dead)
-        return ""
-
-    def _jump_fault(self, key: _Key, number: int) -> str:
-        """Return why a number can't be of this life of an actor, or ""; the first number may be any."""
-        account = self._accounts.get(key)
-        if account is None or key in self._awaited or not account.published:
-            return ""
-        jump = BEYOND_CREDITS if account.credit_limit else LONGEST_JUMP
-        most = max(account.published, account.credit_limit) + jump
-        return "" if number <= most else f"number {number}; allowed: up to {most}"
-
-    def _close(self, key: _Key) -> None:
-        """Add the account of a dead life to that of all earlier lives."""
-        earlier = self._accounts.get(EARLIER) or Account(*EARLIER)
-        self._accounts[EARLIER] = folded(earlier, self._accounts.pop(key))
-        self._summed[EARLIER] = (-1, *self._summed.pop(EARLIER, (-1, Ledger(), 0))[1:])
-        self._changed |= {key, EARLIER}
-        self._dead_since.pop(key, None)
-        self._closed[key] = None
-        while len(self._closed) > LIVES_KEPT:
-            del self._closed[next(iter(self._closed))]
-        if self._newest.get(key[0]) == key[1]:
-            del self._newest[key[0]]
-
-    def _note_contract(self, key: _Key, account: Account, training_hash: str) -> None:
+    def _note_contract(self, account: Account, training_hash: str) -> None:
         """Remember what the actor plays; another task, network or experience is a misfit."""
-        account.training_hash = training_hash
-        if self._fits(account) or not account.is_alive:
-            self._misfits.pop(key, None)
+        account.fits = training_hash == self._learner_state.training_hash
+        life = (account.actor, account.incarnation)
+        if account.fits or not account.is_alive:
+            self._misfits.pop(life, None)
             return
-        misfit = Misfit(*key, training_hash)
-        if key not in self._misfits:
+        misfit = Misfit(*life, training_hash)
+        if life not in self._misfits:
             self._new_misfits.append(misfit)
-        self._misfits[key] = misfit
-
-    def _fits(self, account: Account) -> bool:
-        """Return whether the actor has the learner's contract."""
-        return account.training_hash == self._learner_state.training_hash
+        self._misfits[life] = misfit
 
     def _settle(self, entry: Queued, fate: Outcome) -> None:
-        key = entry.header.life
-        self._changed.add(key)
-        self._accounts[key].settle(entry.header.sequence, fate)
+        self._accounts.settle(entry.header.life, entry.header.sequence, fate)
 
     def _drop_unfit(self, entry: Queued) -> None:
         """Drop a rollout of a checkpoint that the present settings can't train on."""
@@ -503,60 +373,9 @@ class Intake:
             report_after_s=self.report_after_s,
         )
 
-    # ---- credits
-
-    def _grant(self, key: _Key, account: Account) -> None:
-        """Raise the actor's limit as far as data is needed and its window allows."""
-        self._recount(key, account)
-        if not (account.is_alive and self._fits(account)) or self._now < account.no_credits_before:
-            return
-        granted = min(self._wanted(), self._config.window - _outstanding(account))
-        if granted > 0:
-            account.credit_limit = max(account.credit_limit, account.published) + granted
-            self._progress(key, account)
-
-    def _progress(self, key: _Key, account: Account) -> None:
-        """Record that the actor got credits or brought a new rollout: its credits count from now."""
-        account.last_progress = self._now
-        self._promised -= self._holders.pop(key, 0)
-        self._recount(key, account)
-
-    def _recount(self, key: _Key, account: Account) -> None:
-        """Bring the actor's part of the promised rollouts up to date."""
-        is_fresh = self._now - account.last_progress < self._config.credit_patience_s
-        part = 0
-        if account.is_alive and self._fits(account) and is_fresh:
-            part = min(_outstanding(account), self._config.window)
-        self._promised += part - self._holders.get(key, 0)
-        if part:
-            self._holders[key] = part
-        else:
-            self._holders.pop(key, None)
-
     def _wanted(self) -> int:
         """Return how many more rollouts of the present version are needed within the target lag."""
-        while self._holders:  # those that have made no progress for long are in front
-            key = next(iter(self._holders))
-            if self._now - self._accounts[key].last_progress < self._config.credit_patience_s:
-                break
-            self._promised -= self._holders.pop(key)
         # nothing is collected for the time after a stage change: it would be lost
         ahead = min(self._config.lag_aimed_at + 1, self._learner_state.datasets_left)
         datasets = ahead - bool(self._in_update)
-        return datasets * self._config.dataset_rollouts - len(self._queue) - self._promised
-
-
-def pause_after(refusals: int) -> float:
-    """Return how long an actor gets no credits after so many refusals in a row [s]."""
-    if refusals <= FREE_REFUSALS:
-        return 0.0
-    return min(2.0 ** min(refusals - FREE_REFUSALS, 32), LONGEST_PAUSE_S)
-
-
-def _outstanding(account: Account) -> int:
-    """Return how many rollouts an actor may still send or has in flight."""
-    return max(0, account.credit_limit - account.published) + account.missing
-
-
-def _closed_reason(key: _Key) -> str:
-    return f"life {key[1]} of actor {key[0]} ended, and its account is closed: start the actor again"
+        return datasets * self._config.dataset_rollouts - len(self._queue)

@@ -109,7 +109,7 @@ class Account:
         self.actor = actor
         self.incarnation = incarnation
         self.is_out_of_sight = False  # its liveliness token is gone: its reports are older than that
-        self.training_hash = ""  # of its last message
+        self.fits = False  # its last message had the learner's task, network and experience
         self.last_progress = 0.0  # [s] time of its last grant or new rollout, on the caller's clock
         self.refused_in_a_row = 0
         self.no_credits_before = 0.0  # [s] end of its pause after refusals

@@ -279,8 +279,8 @@ class World(RuleBasedStateMachine):
             assert min(ledger.trained, ledger.dropped, ledger.in_flight, ledger.lost) >= 0
         assert self.intake.total() == sum(ledgers.values(), Ledger())
         assert self.intake.total().trained == len(self.trained)
-        assert self.intake.gaps() == sum(account.gaps for account in self.intake._accounts.values())
-        assert self.intake._promised == sum(self.intake._holders.values())
+        assert self.intake.gaps() == sum(account.gaps for account in self.intake._accounts._accounts.values())
+        assert self.intake._credits._promised == sum(self.intake._credits._holders.values())
 
     @invariant()
     def of_actors_without_token_only_queued_rollouts_are_in_flight(self) -> None:

@@ -8,17 +8,10 @@ from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, VerdictKind
 from services.actor.outbox import Flight, Outbox, OutboxConfig, report
-from services.learner import intake as intake_module
+from services.learner import accounts as accounts_module
+from services.learner.accounts import BEYOND_CREDITS, EARLIER, FOLD_AFTER_S
 from services.learner.admission import RULES, open_rollout
-from services.learner.intake import (
-    BEYOND_CREDITS,
-    EARLIER,
-    FOLD_AFTER_S,
-    IDLE_REPORTS_HZ,
-    SOONEST_REPORT_S,
-    Intake,
-    IntakeConfig,
-)
+from services.learner.intake import IDLE_REPORTS_HZ, SOONEST_REPORT_S, Intake, IntakeConfig
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake
@@ -435,7 +428,7 @@ def test_an_actor_that_sends_without_credits_fills_no_queue():
 
 
 def test_a_peer_of_many_names_gets_a_bounded_number_of_accounts(monkeypatch):
-    monkeypatch.setattr(intake_module, "MOST_ACCOUNTS", 20)
+    monkeypatch.setattr(accounts_module, "MOST_ACCOUNTS", 20)
     intake = make_intake(dataset_rollouts=1)
     claim = make_report(Outbox(OutboxConfig(), next_sequence=1, generation=1, flights=(FLIGHT,)))
     for number in range(100):
