@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from pydantic import Field
 
-from benchmarks.chaos.check import RULES, Result, check
+from benchmarks.chaos.check import NOT_ACCOUNTED, RULES, Result, check
 from benchmarks.chaos.faults import make
 from benchmarks.chaos.schedule import KINDS, Fault, schedule
 from benchmarks.chaos.site import MAX_LAG, Site
@@ -26,14 +26,6 @@ from common.service.process import DONE
 
 log = logging.getLogger(__name__)
 
-NOT_ACCOUNTED: Final = (
-    "accepted_and_gone",
-    "unsettled",
-    "gap",
-    "verdict_unfounded",
-    "ledger",
-    "died_unasked",
-)
 PATIENCE_S: Final = 60.0  # for an epoch after a fault that ended the learner
 SHOWN: Final = 20
 MOST_FAULTS: Final = 10_000

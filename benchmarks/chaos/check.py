@@ -36,6 +36,17 @@ RULES: Final[Mapping[str, str]] = {
 }
 
 
+NOT_ACCOUNTED: Final = (
+    "accepted_and_gone",
+    "unsettled",
+    "gap",
+    "verdict_unfounded",
+    "ledger",
+    "died_unasked",
+)
+"""Rules whose violation means that the fate of a rollout is not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class Violation:
     """A rule that did not hold."""

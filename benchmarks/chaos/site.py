@@ -22,6 +22,7 @@ from typing import Any, Final
 import psutil
 
 from benchmarks.chaos.slow_wire import SlowWire
+from benchmarks.hosts import ip, system
 from common.errors import ReportedError
 from deploy.prepare import free_port
 
@@ -262,7 +263,7 @@ class Site:
 
     def set_cable(self, is_in: bool) -> None:
         """Take the far host's cable out, or put it in."""
-        _ip("link", "set", self.cable, "up" if is_in else "down")
+        ip("link", "set", self.cable, "up" if is_in else "down")
 
     # ---- the end
 
@@ -289,8 +290,8 @@ class Site:
             self.wire.close()
         if self._namespace:
             with suppress(ReportedError):
-                _ip("link", "del", self.cable)
-            _ip("netns", "del", self._namespace)
+                ip("link", "del", self.cable)
+            ip("netns", "del", self._namespace)
         if self._has_disk:
             shutil.copytree(self.run / "logs", self.folder / "logs", dirs_exist_ok=True)
             subprocess.run(["umount", "--lazy", str(self.work)], check=False)
@@ -298,9 +299,8 @@ class Site:
     # ---- privileges
 
     def _mount(self) -> None:
-        what = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "topspin-chaos", str(self.work)]
         try:
-            _system(what)
+            system("mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "topspin-chaos", str(self.work))
             self._has_disk = True
         except ReportedError as error:
             self.skipped["disk_full"] = str(error)
@@ -309,33 +309,20 @@ class Site:
         """Make a network namespace with a cable to it; return the address that the hub listens at."""
         name = f"chaos{os.getpid() % 100_000}"
         try:
-            _ip("netns", "add", name)
+            ip("netns", "add", name)
         except ReportedError as error:
             self.skipped["link_cut"] = self.skipped["pause_remote"] = str(error)
             return "127.0.0.1"
         self._namespace = name
         inside = ("netns", "exec", name, "ip")
-        _ip("link", "add", self.cable, "type", "veth", "peer", "name", f"{name}b")
-        _ip("link", "set", f"{name}b", "netns", name)
-        _ip("addr", "add", f"{FAR_LINK}.1/24", "dev", self.cable)
-        _ip("link", "set", self.cable, "up")
-        _ip(*inside, "addr", "add", f"{FAR_LINK}.2/24", "dev", f"{name}b")
-        _ip(*inside, "link", "set", f"{name}b", "up")
-        _ip(*inside, "link", "set", "lo", "up")
+        ip("link", "add", self.cable, "type", "veth", "peer", "name", f"{name}b")
+        ip("link", "set", f"{name}b", "netns", name)
+        ip("addr", "add", f"{FAR_LINK}.1/24", "dev", self.cable)
+        ip("link", "set", self.cable, "up")
+        ip(*inside, "addr", "add", f"{FAR_LINK}.2/24", "dev", f"{name}b")
+        ip(*inside, "link", "set", f"{name}b", "up")
+        ip(*inside, "link", "set", "lo", "up")
         return f"{FAR_LINK}.1"
-
-
-def _ip(*arguments: str) -> None:
-    _system(["ip", *arguments])
-
-
-def _system(command: Sequence[str]) -> None:
-    try:
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
-    except OSError as error:
-        raise ReportedError(f"{command[0]}: {error.strerror}") from None
-    if done.returncode:
-        raise ReportedError(f"{' '.join(command[:3])}: {done.stderr.strip()}")
 
 
 def _close_pipe(process: subprocess.Popen[bytes]) -> None:
