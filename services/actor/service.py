@@ -30,6 +30,7 @@ from services.actor.rally_feed import RallyFeed, StopRequested
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S = 0.05
+MOST_REASONS: Final = 16  # of waiting, that the log names while an actor is idle
 REPORT_INTERVAL_S = 0.25  # while without credits, until the learner sets another: a lost grant is repeated
 ASK_AGAIN_S = 1.0  # pause between requests for the policy
 LAST_VERDICTS_S = 2.0  # wait at the end for rollouts in flight
@@ -91,8 +92,7 @@ class ActorService:
         self._frames = 0
         self._rally_gaps = 0  # batches that were lost on their way
         self._idle_since: float | None = None
-        self._warned = False
-        self._waits_for = ""
+        self._told: set[str] = set()  # what it waits for, said since it is idle
         for kind in REFUSALS:  # from nothing to 1 would be no rise for Prometheus
             metrics.inc("topspin_rollouts_refused_total", 0.0, reason=kind.value)
         self._member.join()
@@ -218,11 +218,11 @@ class ActorService:
     def _wait_for(self, reason: str, now: float) -> None:
         self._member.state = "draining" if self._member.is_draining else "waiting"
         if self._idle_since is None:
-            self._idle_since, self._warned = now, False
-        if reason != self._waits_for:
-            self._waits_for, self._warned = reason, False
-        if not self._warned and now - self._idle_since > self._config.silence_warning_s:
-            self._warned = True
+            self._idle_since = now
+            self._told.clear()
+        is_news = reason not in self._told and len(self._told) < MOST_REASONS
+        if is_news and now - self._idle_since > self._config.silence_warning_s:
+            self._told.add(reason)
             log.warning("waiting for=%r seconds=%.0f", reason, now - self._idle_since)
         outcome = self._report.poll() if self._report else NoReply.TIMEOUT
         if outcome is not None and now >= self._next_report:

@@ -58,6 +58,7 @@ def test_an_actor_of_another_contract_holds_no_credits_and_is_named_once(tmp_pat
     assert "actor=1 has training" in lines[0]
     assert len(policies) == 1  # and not one for each version
     assert waits
+    assert len(waits) == len(set(waits)) <= 2  # its own view and the learner's, each once
 
 
 def test_credits_of_an_actor_that_reports_and_never_plays_go_to_others(tmp_path):

@@ -1,13 +1,18 @@
 """A real Prometheus beside a run of real processes, with the settings and rules of deploy/monitoring."""
 
 import json
+import resource
 import shutil
+import socket
 import subprocess
+import threading
+import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 
+import psutil
 import pytest
 import yaml
 
@@ -58,25 +63,36 @@ class Api:
     def has_data(self, expression):
         return bool(self.get("query", query=expression)["result"])
 
+    def all_firing(self):
+        """Return name, role and id of each alarm that stands."""
+        found = [alert["labels"] for alert in self.get("alerts")["alerts"] if alert["state"] == "firing"]
+        return {(labels["alertname"], labels["role"], labels["id"]) for labels in found}
+
     def firing(self):
-        """Return name, role and id of each alarm that stands, without those that a busy machine raises."""
-        found = [alert for alert in self.get("alerts")["alerts"] if alert["state"] == "firing"]
-        found = [alert for alert in found if alert["labels"]["alertname"] not in OF_A_BUSY_MACHINE]
-        return {(a["labels"]["alertname"], a["labels"]["role"], a["labels"]["id"]) for a in found}
+        """Return the same without those that a busy machine raises."""
+        return {alarm for alarm in self.all_firing() if alarm[0] not in OF_A_BUSY_MACHINE}
 
 
 @contextmanager
-def prometheus_of(folder):
-    """Yield a Prometheus that watches the run in ``folder``; its intervals and waits are shortened to 1 s."""
+def prometheus_of(folder, shorter=()):
+    """Yield a Prometheus that watches the run in ``folder``; its intervals and waits are shortened to 1 s.
+
+    Args:
+        folder: Of the run. Targets of other processes are read from its more.json.
+        shorter: Texts of the rules' expressions, and shorter ones for them.
+    """
     rules, config, port = alarms.rules(), prometheus(), free_port()
     for group in rules["groups"]:
         group["interval"] = "1s"
         for rule in group["rules"]:
             rule.pop("for", None)
+            for long, short in shorter:
+                rule["expr"] = rule["expr"].replace(long, short)
     config["global"] = {"scrape_interval": "1s", "scrape_timeout": "1s", "evaluation_interval": "1s"}
     config["rule_files"] = [str(folder / "alerts.yml")]
     (discovery,) = config["scrape_configs"][0]["file_sd_configs"]
-    discovery |= {"files": [str(folder / "runs/latest/targets.json")], "refresh_interval": "1s"}
+    files = [str(folder / "runs/latest/targets.json"), str(folder / "more.json")]
+    discovery |= {"files": files, "refresh_interval": "1s"}
     (folder / "alerts.yml").write_text(yaml.safe_dump(rules))
     (folder / "prometheus.yml").write_text(yaml.safe_dump(config))
     with (folder / "prometheus.log").open("w") as log:
@@ -136,3 +152,130 @@ def test_every_target_is_up_every_expression_has_data_and_an_alarm_stands_when_i
             stranger.request(Keys("r").rollout("9"), b"rubbish", 5.0, Flow.ROLLOUT).wait()
         refused = ("TopspinMessagesRefused", "learner", "0")
         wait_until(lambda: refused in api.firing(), 60, "its alarm")
+
+
+class Wire:
+    """A TCP connection to the hub that can be cut."""
+
+    def __init__(self, hub_port):
+        self.port, self._hub_port, self._ends = free_port(), hub_port, []
+        self._listening = socket.create_server(("127.0.0.1", self.port))
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self):
+        """Cut what is connected; a new connection is made at once."""
+        ends, self._ends = self._ends, []
+        for end in ends:
+            with suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def has_link(self):
+        """Return whether a connection stands for long enough that its service has noted it."""
+        return bool(self._ends) and time.monotonic() - self._since > 2.0
+
+    def close(self):
+        self.cut()
+        self._listening.close()
+
+    def _accept(self):
+        with suppress(OSError):  # closed
+            while True:
+                near, _ = self._listening.accept()
+                try:
+                    far = socket.create_connection(("127.0.0.1", self._hub_port))
+                except OSError:  # the hub is not there yet
+                    near.close()
+                    continue
+                self._ends, self._since = [*self._ends, near, far], time.monotonic()
+                for source, sink in ((near, far), (far, near)):
+                    threading.Thread(target=self._pass, args=(source, sink), daemon=True).start()
+
+    def _pass(self, source, sink):
+        with suppress(OSError):
+            while data := source.recv(65_536):
+                sink.sendall(data)
+        with suppress(OSError):
+            sink.shutdown(socket.SHUT_RDWR)
+
+
+def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
+    port, metrics = free_port(), free_port()
+    flags = ("--run", "r", "--actors", 2, "--endpoint", f"tcp/127.0.0.1:{port}", *TINY)
+    sick = (
+        *("--learner.curriculum.stage-1", 100_000, "--learner.checkpoint-interval-s", 1),
+        *("--learner.intake.target-lag", 6, "--learner.intake.max-lag", 8),  # TopspinActorsLag
+        *("--learner.divergence.collapse", 0.99, "--learner.divergence.patience", 1),  # TopspinDiverged
+        *("--learner.divergence.least", 0.01, "--watchdog-s", 0),
+    )
+    wire = Wire(port)
+    misfit = (  # TopspinMisfitActors, and by its rare heartbeats TopspinServiceHangs
+        *("--run", "r", "--id", "odd", "--index", 7, "--endpoint", f"tcp/127.0.0.1:{wire.port}"),
+        *("--network.units", "16,16", "--envs", 16, "--status-interval-s", 15, "--metrics-port", metrics),
+    )
+    target = {"targets": [f"127.0.0.1:{metrics}"], "labels": {"run": "r", "role": "actor", "id": "odd"}}
+    (tmp_path / "more.json").write_text(json.dumps([target]))
+    seen = set()
+    shorter = [
+        ("> 180", "> 8"),
+        ('topspin_frames_total{role="learner"}[5m]', 'topspin_frames_total{role="learner"}[8s]'),
+    ]
+    with (
+        closing(wire),
+        running(tmp_path, "deploy.local", *flags, *sick),
+        running(tmp_path, "services.actor", *misfit) as odd,
+        prometheus_of(tmp_path, shorter) as api,
+    ):
+
+        def fires(*names, again=lambda: None):
+            """Return whether all of these have fired; ``again`` makes their cause."""
+            again()
+            time.sleep(1.0)
+            seen.update(name for name, *_ in api.all_firing())
+            return seen.issuperset(names)
+
+        def wait_for(*names, again=lambda: None):
+            wait_until(lambda: fires(*names, again=again), 60, lambda: f"{set(names) - seen}")
+
+        wait_until(lambda: api.health().get(("actor", "odd")) == "up", 120, "all to start")
+        wait_until(lambda: len(players(tmp_path)) == 2, 120, "the run's actors")
+        (learner,) = children_of(tmp_path, "learner").values()
+        (generator,) = children_of(tmp_path, "generator").values()
+        wait_for("TopspinActorsLag", "TopspinMisfitActors", "TopspinServiceHangs", "TopspinDiverged")
+        wait_for("TopspinLinkUnstable", again=lambda: wire.has_link() and wire.cut())
+        handles = psutil.Process(odd.process.pid).num_fds()
+        resource.prlimit(odd.process.pid, resource.RLIMIT_NOFILE, (handles + 4, handles + 4))
+        wait_for("TopspinFilesRunOut")
+        odd.process.kill()
+        wait_for("TopspinServiceDown")
+        resource.prlimit(learner.pid, resource.RLIMIT_FSIZE, (1024, resource.RLIM_INFINITY))
+        wait_for("TopspinSavesFail")
+        resource.prlimit(learner.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        generator.suspend()
+        wait_for("TopspinNoRallies")
+        generator.resume()
+        with closing(
+            open_zenoh(ZenohConfig(endpoint=f"tcp/127.0.0.1:{port}", connect_timeout_s=10.0))
+        ) as stranger:
+            stranger.request(Keys("r").rollout("9"), b"rubbish", 5.0, Flow.ROLLOUT).wait()
+        wait_for("TopspinMessagesRefused")
+        one, *others = players(tmp_path)
+
+        def pause_one():
+            one.suspend()
+            time.sleep(2.0)
+            one.resume()
+
+        wait_for("TopspinRolloutsTooOld", again=pause_one)
+        for actor in (one, *others):
+            actor.suspend()
+        wait_for("TopspinNoActors", "TopspinNotTraining", "TopspinNotSaved")
+        for actor in (one, *others):
+            actor.resume()
+        wait_for("TopspinRolloutsLost", again=lambda: [actor.kill() for actor in players(tmp_path)[:1]])
+
+    assert seen == {alarm.name for alarm in alarms.ALARMS}
+
+
+def players(folder):
+    """Return the actors of the run in ``folder`` that play; the spare one that waits for a place is none."""
+    return [process for process in children_of(folder, "actor").values() if "--id" in process.cmdline()]
