@@ -271,11 +271,16 @@ def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
         wait_for("TopspinNoActors", "TopspinNotTraining", "TopspinNotSaved")
         for actor in (one, *others):
             actor.resume()
-        wait_for("TopspinRolloutsLost", again=lambda: [actor.kill() for actor in players(tmp_path)[:1]])
+
+        def kill_one():
+            next(iter(children_of(tmp_path, "actor").values())).kill()  # maybe with a rollout in flight
+            time.sleep(2.0)
+
+        wait_for("TopspinRolloutsLost", again=kill_one)
 
     assert seen == {alarm.name for alarm in alarms.ALARMS}
 
 
 def players(folder):
-    """Return the actors of the run in ``folder`` that play; the spare one that waits for a place is none."""
-    return [process for process in children_of(folder, "actor").values() if "--id" in process.cmdline()]
+    """Return the run's actors; neither the spare one that waits for a place, nor the misfit, has a --config."""
+    return [process for process in children_of(folder, "actor").values() if "--config" in process.cmdline()]
