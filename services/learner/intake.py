@@ -17,13 +17,12 @@ again and again pauses. The cost of a report does not depend on the number of ac
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Self
-
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing import Final
 
 from common.comms.budgets import one_line
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
 from services.learner.admission import Case, Header, LearnerState, differs, judge
+from services.learner.config import IntakeConfig
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, Outcome, folded, restored
 
 # These are not recorded: the rollout has a verdict, or its actor sends it again.
@@ -44,50 +43,6 @@ BEYOND_CREDITS: Final = 64  # more than any window: from what this learner grant
 LONGEST_JUMP: Final = 65_536  # more than any outage takes: from what an earlier learner may have granted
 
 EARLIER: Final = ("", 0)  # the account of all closed lives
-
-
-class IntakeConfig(BaseModel):
-    """How much data an update takes, and how old it may be."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
-    max_lag: int = Field(
-        2,
-        ge=0,
-        le=64,
-        description="versions that a rollout may be older than the learner's; 0 is strictly synchronous",
-    )
-    target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
-    queue_rollouts: int = Field(
-        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
-    )
-    window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
-    credit_patience_s: float = Field(
-        30.0,
-        gt=0,
-        description="time without a new rollout after which an actor's credits go to others",
-        json_schema_extra={"unit": "s"},
-    )
-
-    @model_validator(mode="after")
-    def _a_dataset_fits_into_the_queue(self) -> Self:
-        if self.dataset_rollouts > self.queue_rollouts:
-            raise ValueError(
-                f"dataset_rollouts {self.dataset_rollouts}; allowed: up to queue_rollouts, {self.queue_rollouts}"
-            )
-        return self
-
-    @property
-    def lag_aimed_at(self) -> int:
-        """Return how many datasets beyond the present one are collected ahead."""
-        return min(self.target_lag, self.max_lag)
-
-    def for_actors(self, actors: int) -> Self:
-        """Return the settings with the size of a dataset for so many actors, and a queue of at least two datasets."""
-        rollouts = self.dataset_rollouts or actors
-        queue = self.queue_rollouts if self.dataset_rollouts else max(self.queue_rollouts, 2 * rollouts)
-        return self.model_copy(update={"dataset_rollouts": rollouts, "queue_rollouts": queue})
 
 
 @dataclass(frozen=True, slots=True)

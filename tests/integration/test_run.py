@@ -9,7 +9,7 @@ import torch
 
 from common.policy.folder import load_policy
 from common.task.experience import ExperienceConfig
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig
 from tests.integration.in_process_run import CURRICULUM, PPO, local_run, wait_until
 from tests.unit.env.teachers import write_teacher
 

@@ -4,7 +4,9 @@ from typing import ClassVar, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.service.config import SHARED, TABLES, ConfigError, HelpRequest, load, save_settings, to_tables
+from common.errors import ConfigError, HelpRequest
+from common.service.config import load, save_settings, to_tables
+from common.service.config_sources import SHARED, TABLES
 
 
 class Frozen(BaseModel):
@@ -33,7 +35,7 @@ class LearnerOptions(Frozen):
 class Learner(Shared):
     """Settings of a learner."""
 
-    often: ClassVar = ("run", "max_lag", "ppo.clip")
+    often: ClassVar = {"The run": ("run",), "Learning": ("max_lag", "ppo.clip")}
 
     max_lag: int = Field(2, ge=0, description="versions behind", json_schema_extra={"unit": "versions"})
     learning_rate: float = Field(5e-4, gt=0)

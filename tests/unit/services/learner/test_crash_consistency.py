@@ -6,17 +6,17 @@ import shutil
 import numpy as np
 import pytest
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, save_policy
-from common.service.config import read_toml, save_settings
+from common.service.config import save_settings
+from common.service.config_sources import read_toml
 from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.learner import checkpoint
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.generation import next_generation
-from services.learner.ppo import PPOConfig
 from services.learner.run_log import RunLog
 from services.learner.training import Training
 from tests.crash_points import killed_at_each_call

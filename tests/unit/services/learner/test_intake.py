@@ -7,9 +7,11 @@ import pytest
 from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, VerdictKind
-from services.actor.outbox import Flight, Outbox, OutboxConfig, report
+from services.actor.config import OutboxConfig
+from services.actor.outbox import Flight, Outbox, report
 from services.learner import intake as intake_module
 from services.learner.admission import RULES, open_rollout
+from services.learner.config import IntakeConfig
 from services.learner.intake import (
     BEYOND_CREDITS,
     EARLIER,
@@ -17,7 +19,6 @@ from services.learner.intake import (
     IDLE_REPORTS_HZ,
     SOONEST_REPORT_S,
     Intake,
-    IntakeConfig,
 )
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
 from tests.unit.comms.test_codec import sealed

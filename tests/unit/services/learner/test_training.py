@@ -8,13 +8,12 @@ import pytest
 import torch
 
 from common.comms.messages import Episodes
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.epoch_stats import play_stats
-from services.learner.ppo import PPOConfig
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 import tomli_w
 
-from common.errors import ReportedError
-from common.policy.actor_critic import NetworkConfig
+from common.errors import ConfigError, HelpRequest, ReportedError
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, mean_policy, save_policy
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
-from common.service.config import ConfigError, HelpRequest, load, to_tables
+from common.service.config import load, to_tables
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import critic_layout, size
@@ -145,7 +145,7 @@ def test_groups_are_named_by_their_differences():
             make_run("g", task=observing(**usual)),
             make_run("h", task=observing(ball="filtered")),
             make_run("i", task=observing(ball="filtered", **usual)),
-            make_run("j", task=observing(), experience={"teacher": {"policy": "assets/policies/default"}}),
+            make_run("j", task=observing(), experience={"teacher": {"policy": "common/policies/default"}}),
         ]
     )
 
