@@ -220,6 +220,11 @@ class LearnerOptions(BaseModel):
         description="time without a dataset after which the log says what is missing",
         json_schema_extra={"unit": "s"},
     )
+    writers: tuple[str, ...] = Field(
+        (),
+        description="more writers of the run's curves, besides TensorBoard's: entry points topspin.writers of "
+        "installed packages",
+    )
     history: str = Field(
         "", description="folder for a history: a line for each event of a rollout; empty: none"
     )
