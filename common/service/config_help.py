@@ -150,8 +150,8 @@ def _by_table(model: type[BaseModel], settings: Mapping[str, Setting]) -> dict[s
         for table in tables:
             owner = owner.model_fields[table].annotation  # type: ignore[assignment]  # settings_of found a model there
         if tables:
-            purpose = inspect.cleandoc(owner.__doc__ or "").splitlines()[0].rstrip(".")
-            title = f"[{'.'.join(tables)}] {purpose}"
+            purpose = inspect.cleandoc(owner.__doc__ or "").partition("\n")[0].rstrip(".")
+            title = f"[{'.'.join(tables)}] {purpose}".rstrip()
         groups.setdefault(title, []).append(path)
     return groups
 

@@ -103,3 +103,19 @@ def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp
     assert resumed.service.training.progress.epoch == len(rows)
     assert ledger.refused == {}
     assert ledger.balance == ledger.lost == 0
+
+
+def test_the_untrained_policy_is_neither_evaluated_nor_the_best(tmp_path):
+    with local_run(tmp_path) as s:
+        s.learner()
+        evaluator = s.evaluator(interval_s=0.1)
+        wait_until(lambda: evaluator.service.state == "waiting", 10, "an evaluator that asks for the policy")
+        s.generator()
+        s.actor(0, shards=1)
+        wait_until((tmp_path / "policy" / "best").exists, 60, "a best policy")
+        s.take_down(evaluator)
+    with (tmp_path / "report" / "evaluations.csv").open() as file:
+        frames = [int(row["frames"]) for row in csv.DictReader(file)]
+
+    assert min(frames) > 0
+    assert load_policy(tmp_path / "policy" / "best").contract.frames > 0
