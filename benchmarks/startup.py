@@ -3,7 +3,7 @@
     python -m benchmarks.startup --json
 
 Every figure is the median of fresh processes. Beside it stand a Python that does nothing, and one that imports what
-every settings model needs.
+every settings model needs; and the CPU time, which other work on the machine changes less.
 """
 
 import json
@@ -62,25 +62,32 @@ def environment() -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))}
 
 
-def seconds_of(words: Sequence[str]) -> float:
-    """Return how long a Python process takes from its start to its end [s]."""
-    started = time.perf_counter()
+def seconds_of(words: Sequence[str]) -> tuple[float, float]:
+    """Return how long a Python process takes from its start to its end, and its CPU time [s]."""
+    started, cpu = time.perf_counter(), sum(os.times()[2:4])
     subprocess.run([sys.executable, *words], env=environment(), check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - started
+    return time.perf_counter() - started, sum(os.times()[2:4]) - cpu
 
 
 def command_figures(processes: int, stop: Event) -> dict[str, Any]:
     """Return the medians of every `--help`, the version and the references; all take turns."""
-    taken: dict[tuple[str, ...], list[float]] = {words: [] for words in (*HELP, *OTHERS.values())}
+    taken: dict[tuple[str, ...], list[tuple[float, float]]] = {
+        words: [] for words in (*HELP, *OTHERS.values())
+    }
     for _ in range(processes):
         for words, found in taken.items():
             check(stop)
             found.append(seconds_of(words))
-    median = {words: round(statistics.median(found), 3) for words, found in taken.items()}
+    median, cpu = (
+        {words: round(statistics.median(pair[k] for pair in found), 3) for words, found in taken.items()}
+        for k in (0, 1)
+    )
     slowest = max(HELP, key=lambda words: median[words])
     return {
         "help_s_max": median[slowest],
         "help_slowest": " ".join(slowest),
+        "help_cpu_s_max": max(cpu[words] for words in HELP),
+        "version_cpu_s": cpu[OTHERS["version_s"]],
         **{name: median[words] for name, words in OTHERS.items()},
     }
 

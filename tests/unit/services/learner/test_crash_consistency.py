@@ -125,7 +125,7 @@ def test_a_killed_resume_leaves_curve_settings_and_generation_whole(tmp_path, fo
     first = next_generation(template / ".generation", 0)
 
     def resume():
-        RunLog(folder / "metrics.csv", folder / "tb").truncate(30, 0)
+        RunLog(folder / "metrics.csv", folder / "tb", folder / "e.csv").truncate(30, 0)
         save_settings(folder / "config.toml", {"run": "new"})
         next_generation(folder / ".generation", 0)
 

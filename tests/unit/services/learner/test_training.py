@@ -268,7 +268,7 @@ def test_unvalidated_balls_are_in_no_rate():
 
 def test_an_epoch_without_ended_rallies_has_nan_rates_in_the_log(tmp_path):
     """No rally ended, or no validated one."""
-    training, record = make_training(), RunLog(tmp_path / "metrics.csv", tmp_path / "tb")
+    training, record = make_training(), RunLog(tmp_path / "metrics.csv", tmp_path / "tb", tmp_path / "e.csv")
     ended = make_rollout(0).episodes
     for epoch, episodes in enumerate(
         (
