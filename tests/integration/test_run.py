@@ -23,7 +23,8 @@ def ledger(scraped):
 def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_path):
     with local_run(tmp_path) as s:
         learner = s.learner()  # the hub: it must listen before the others connect
-        generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
+        evaluator = s.evaluator()  # it asks for the policy before anything is trained
+        generator, actors = s.generator(), [s.actor(0), s.actor(1)]
         wait_until(lambda: learner.service.training.progress.stage == 3, 60, "stage 3")
         wait_until(
             lambda: all(actor.scrape()["topspin_stage"] == 3 for actor in actors),
@@ -53,6 +54,9 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
     assert (
         json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
     )
+    with (tmp_path / "report" / "evaluations.csv").open() as file:
+        assert min(int(row["frames"]) for row in csv.DictReader(file)) > 0  # never the untrained policy
+    assert load_policy(tmp_path / "policy" / "best").contract.frames > 0
     assert list((tmp_path / "tb").iterdir())
 
 
@@ -103,19 +107,3 @@ def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp
     assert resumed.service.training.progress.epoch == len(rows)
     assert ledger.refused == {}
     assert ledger.balance == ledger.lost == 0
-
-
-def test_the_untrained_policy_is_neither_evaluated_nor_the_best(tmp_path):
-    with local_run(tmp_path) as s:
-        s.learner()
-        evaluator = s.evaluator(interval_s=0.1)
-        wait_until(lambda: evaluator.service.state == "waiting", 10, "an evaluator that asks for the policy")
-        s.generator()
-        s.actor(0, shards=1)
-        wait_until((tmp_path / "policy" / "best").exists, 60, "a best policy")
-        s.take_down(evaluator)
-    with (tmp_path / "report" / "evaluations.csv").open() as file:
-        frames = [int(row["frames"]) for row in csv.DictReader(file)]
-
-    assert min(frames) > 0
-    assert load_policy(tmp_path / "policy" / "best").contract.frames > 0
