@@ -59,6 +59,7 @@ fix: $(STAMP)             ## format, and mend what ruff can
 	$(BIN)/ruff check --fix .
 
 bench: $(STAMP)           ## the quick benchmarks
+	$(BIN)/python -m benchmarks.startup --json
 	$(BIN)/python -m benchmarks.generator --json
 	$(BIN)/python -m benchmarks.env --json
 	$(BIN)/python -m benchmarks.camera_filter --json

@@ -21,7 +21,7 @@ from benchmarks.settings import TimedConfig, run
 from common.comms.codec import encode
 from common.comms.messages import Rollout
 from services.actor.player import Player
-from services.learner.ppo import PPOConfig
+from services.learner.config import PPOConfig
 
 
 def playing(player: Player) -> Callable[[], Rollout]:

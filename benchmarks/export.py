@@ -34,13 +34,13 @@ from common.perception.camera import DETECTION_BUFFER, READ, detection_row
 from common.physics.constants import GRID_STEP
 from common.policy.box import policy_folder
 from common.policy.folder import Policy, load_policy
-from common.task.config import TaskConfig
+from common.task.config import PresetName, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import Purpose, RallyBlock, draw_rallies
-from common.task.launch_presets import SERVE, PresetName
+from common.task.launch_presets import SERVE
 from common.task.randomization import RallyParameter
 from common.task.states import Outcome
-from topspin.export.command import export_policy
+from topspin.export.folder import export_policy
 from topspin.robot.contract import POLICY_FILE, RobotContract
 from topspin.robot.controller import Controller
 from topspin.robot.network import Network

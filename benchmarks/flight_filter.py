@@ -25,10 +25,10 @@ from common.physics.flight import FULL, flight_step
 from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.table_bounce import table_bounce
 from common.rally.state import SAMPLE
-from common.task.config import Randomization, TaskConfig
+from common.task.config import PresetName, Randomization, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import KIND, LONGEST_FLIGHT, RallyBlock, draw_rallies
-from common.task.launch_presets import SERVE, PresetName
+from common.task.launch_presets import SERVE
 from common.task.observation import ExpectedSpin
 from common.task.randomization import RallyParameter, air_of
 from common.task.states import State

@@ -16,9 +16,8 @@ from pydantic import Field
 from benchmarks.settings import BenchmarkConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import RallyBatch
-from common.task.config import Randomization, TaskConfig
+from common.task.config import PresetName, Randomization, TaskConfig
 from common.task.launch import draw_rallies
-from common.task.launch_presets import PresetName
 
 
 @dataclass(frozen=True, slots=True)

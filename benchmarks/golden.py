@@ -21,12 +21,13 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from benchmarks.settings import BenchmarkConfig, run
+from common.errors import ConfigError
+from common.evaluation.config import MatchConfig
 from common.evaluation.evaluate import check
-from common.evaluation.match import MatchConfig, evaluation_rallies, match_task, play_match
+from common.evaluation.match import evaluation_rallies, match_task, play_match
 from common.evaluation.measures import MatchResult
 from common.policy.box import policy_folder
 from common.policy.folder import load_policy
-from common.service.config import ConfigError
 
 FILE: Final = Path(__file__).parent / "results" / "golden_outcomes.npz"
 SEED: Final = 20260

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from benchmarks import actor, env, learner
 from benchmarks.settings import BenchmarkConfig, run
-from services.learner.ppo import PPOConfig
+from services.learner.config import PPOConfig
 
 FILE: Final = Path(__file__).parent / "results" / "guard.json"
 LEAST_SHARE: Final = 0.75  # of the recorded ratio

@@ -38,15 +38,13 @@ from common.comms.roles import OPERATOR_NAME, Rights, rights_of
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.service.process import DONE
 from common.service.run_folder import LATEST, RUNS, RunFolder
 from deploy.config import DeployConfig
 from deploy.prepare import free_endpoint
 from services.actor.config import ActorOptions
-from services.learner.config import LearnerOptions
-from services.learner.curriculum import CurriculumConfig
-from services.learner.ppo import PPOConfig
+from services.learner.config import CurriculumConfig, LearnerOptions, PPOConfig
 from topspin.certs import CertsConfig, write
 
 GOES_ON_S: Final = 90.0  # longest wait for an epoch after an attack

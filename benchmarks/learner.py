@@ -25,14 +25,15 @@ from common.comms.codec import encode
 from common.policy.actor_critic import ActorCritic
 from common.policy.network_pass import DTYPES
 from services.learner.admission import open_rollout
-from services.learner.ppo import PPOConfig
+from services.learner.config import PPOConfig
+from services.learner.ppo import precision_of
 
 ROLLOUTS = 4  # played before the measurement, and repeated
 
 
 def bare_products(network: ActorCritic, frames: int, ppo: PPOConfig) -> tuple[Callable[[], None], float]:
     """Return a function that computes an epoch's products, and how many floating-point operations they are."""
-    dtype, rows = DTYPES[ppo.products], min(ppo.minibatch, frames)
+    dtype, rows = DTYPES[precision_of(ppo)], min(ppo.minibatch, frames)
     batches = frames // rows
     layers, operations = [], 0.0
     for name, linear in network.named_modules():
@@ -87,7 +88,7 @@ def measure(envs: int, seconds: float, seed: int, ppo: PPOConfig) -> dict[str, f
         "epoch_ms": round(1e3 * measured.seconds, 1),
         "read_ms": round(1e3 * read_s, 1),
         "decode_ms": round(1e3 * decode_s, 2),
-        "precision": ppo.products,
+        "precision": precision_of(ppo),
         "threads": torch.get_num_threads(),
         "frames": frames,
         "minibatch": ppo.minibatch,

@@ -25,8 +25,9 @@ from benchmarks.settings import TimedConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import Rollout
 from deploy.prepare import free_port
+from services.learner.config import PPOConfig
 from services.learner.group import join
-from services.learner.ppo import PPOConfig
+from services.learner.ppo import precision_of
 
 EPOCHS_COMPARED: Final = 3
 WARM_UP: Final = 3  # epochs before the measurement
@@ -113,7 +114,7 @@ def measure(ranks: int, envs: int, seconds: float, turns: int, seed: int) -> dic
         "epochs_compared": EPOCHS_COMPARED,
         "frames": 32 * envs * ranks,
         "minibatch": ppo.minibatch,
-        "precision": ppo.products,
+        "precision": precision_of(ppo),
     }
 
 

@@ -5,16 +5,15 @@ import numpy as np
 from benchmarks.env import RALLIES, MemoryRallies
 from common.comms.messages import PolicySnapshot
 from common.env.robot import home_action
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_hash, training_hash
 from common.policy.weights import pack
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
 from services.actor.player import Player
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.group import ALONE, Group
-from services.learner.ppo import PPOConfig
 from services.learner.training import Training
 
 HORIZON = 32  # control steps of a rollout

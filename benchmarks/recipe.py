@@ -18,12 +18,12 @@ from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
-from common.service.config import load, read_toml, recipe_names, to_tables
+from common.service.config import load, recipe_names, to_tables
+from common.service.config_sources import read_toml
 from common.service.process import DONE
 from common.service.run_folder import RunFolder
 from common.service.table import whole_rows
-from deploy.config import RECIPES, DeployConfig
-from deploy.prepare import SECTION
+from deploy.config import RECIPES, SECTION, DeployConfig
 from topspin.report.collect import find
 from topspin.report.groups import experiment
 

@@ -25,8 +25,7 @@ from common.evaluation.measures import MatchResult, measures
 from common.physics.constants import GRID_STEP
 from common.policy.box import policy_folder
 from common.policy.folder import Policy, load_policy
-from common.task.config import MatchConditions, TaskConfig
-from common.task.launch_presets import PresetName
+from common.task.config import MatchConditions, PresetName, TaskConfig
 from common.task.randomization import MAX_LATENCY_STEPS, RandomizationProfile, profile_of
 
 BALLS_EACH: Final = 10  # of an opponent

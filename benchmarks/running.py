@@ -5,8 +5,8 @@ from contextlib import contextmanager
 from typing import Final
 
 from common.errors import ReportedError
-from deploy.local import LEARNER
 from deploy.prepare import PreparedRun
+from deploy.run import LEARNER
 from deploy.supervisor import Supervisor
 
 WORKER_PATIENCE_S: Final = 10.0

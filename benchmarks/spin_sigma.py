@@ -17,9 +17,8 @@ import numpy as np
 from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
-from common.task.config import FlightName, Randomization, TaskConfig
+from common.task.config import FlightName, PresetName, Randomization, TaskConfig
 from common.task.launch import SPIN, VELOCITY, draw_rallies
-from common.task.launch_presets import PresetName
 from common.task.randomization import PROFILES, table_of
 from topspin.real2sim.fit.fit_problem import FLOWN, FitOptions
 from topspin.real2sim.fit.identify import fit

@@ -2,9 +2,10 @@
 
 numba's own cache notices a change of the file that holds a kernel, but not of the files it calls into: after
 an edit of ``vec.py`` every other kernel would still run the old code. So the cache folder is named after the
-content of all kernel sources, and an edit anywhere starts a fresh one. It is beside the sources, or in the user's own
-cache where the sources belong to someone else. A damaged file of the cache is thrown away and made again, and a cache
-that can't be written costs a compilation at each start: both are one line in the log.
+content of all kernel sources, and an edit anywhere starts a fresh one. Inside it a kernel is found by its module: a
+copy of the project, such as an installed wheel, can use what another copy has compiled. The folder is beside the
+sources of a working copy, else in the user's own cache. A damaged file of the cache is thrown away and made again, and
+a cache that can't be written costs a compilation at each start: both are one line in the log.
 """
 
 import hashlib
@@ -25,7 +26,7 @@ log = logging.getLogger(__name__)
 _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
 _ROOT = Path(__file__).parents[1]
-_FORMAT: Final = 1  # of the cache's files
+_FORMAT: Final = 2  # of the cache's files
 KERNEL_ROOMS: Final = (
     "common/physics",
     "common/task",
@@ -95,10 +96,12 @@ class _KernelCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        stamp: Any = self._impl.locator.get_source_stamp()
+        if room := _room_of(function):
+            self._cache_path = str(Path(numba.config.CACHE_DIR) / room)  # type: ignore[attr-defined]
+            stamp = _FORMAT  # the folder's name says which sources: a copy has other paths and times
         self._cache_file = _CheckedFiles(
-            cache_path=self._cache_path,
-            filename_base=self._impl.filename_base,
-            source_stamp=self._impl.locator.get_source_stamp(),
+            cache_path=self._cache_path, filename_base=self._impl.filename_base, source_stamp=stamp
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -113,6 +116,7 @@ class _KernelCache(FunctionCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled kernel, where that is possible."""
         try:
+            Path(self._cache_path).mkdir(parents=True, exist_ok=True)
             super().save_overload(sig, data)
         except Exception as error:  # a full disk, or an index that was damaged meanwhile
             _say_once(_NOT_KEPT, error)
@@ -124,6 +128,16 @@ class _KernelCache(FunctionCache):
             shutil.rmtree(index) if index.is_dir() else index.unlink(missing_ok=True)
         except OSError as error:
             _say_once(_NOT_KEPT, error)
+
+
+def _room_of(function: Callable[..., Any]) -> str:
+    """Return the dotted folder of a kernel whose source names the cache; "" for a kernel of another file."""
+    folder = Path(function.__code__.co_filename).parent
+    if not folder.is_relative_to(_ROOT):
+        return ""
+    relative = folder.relative_to(_ROOT).as_posix()
+    is_named = any(f"{relative}/".startswith(f"{room}/") for room in KERNEL_ROOMS)
+    return relative.replace("/", ".") if is_named else ""
 
 
 _NOT_KEPT: Final = "compiled kernels can't be kept, so every start compiles"
@@ -154,7 +168,9 @@ def seed_cache(folder: Path, prebuilt: Path) -> None:
 def _folder_of_kernels() -> Path | None:
     """Return this release's folder of kernels; None where they can't be kept."""
     own, installed = os.environ.get("NUMBA_CACHE_DIR"), _ROOT / ".numba_cache"
-    folder = writable_cache([*([Path(own)] if own else []), installed, *user_cache()])
+    is_working_copy = (_ROOT / "pyproject.toml").is_file()  # nothing is written beside installed packages
+    others = [installed, *user_cache()] if is_working_copy else [*user_cache(), installed]
+    folder = writable_cache([*([Path(own)] if own else []), *others])
     if folder is None:
         return None
     digest = _source_digest()

@@ -1,13 +1,17 @@
 """Settings of a whole run on one machine: the number of processes, and the settings of each."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from common.policy.actor_critic import NetworkConfig
-from common.service.config import recipe_names
+from common.errors import ConfigError
+from common.policy.config import NetworkConfig
+from common.service.config import first_look, load, recipe_names
+from common.service.config_sources import read_toml
 from common.service.endpoint import FIRST_PORT
+from common.service.run_folder import LATEST, RunFolder, newest_run
 from common.service.settings import Fleet, RunSettings
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
@@ -18,6 +22,7 @@ from services.learner.budget import BudgetConfig
 from services.learner.config import LearnerOptions
 
 RECIPES: Final = Path(__file__).with_name("recipes")
+SECTION: Final = "local"
 CONNECT_S: Final = 60.0  # limit for the learner to start listening
 
 
@@ -28,10 +33,12 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     --resume.
     """
 
-    often: ClassVar = (
-        *("run", "recipe", "resume", "actors", "minutes", "frames", "seed"),
-        *("task.launch", "task.randomization", "learner.curriculum.first_stage"),
-    )
+    often: ClassVar = {
+        "The run": ("run", "recipe", "resume", "actors"),
+        "Its end": ("minutes", "frames", "json"),
+        "The task": ("task.launch", "task.randomization"),
+        "Training": ("learner.curriculum.first_stage", "seed"),
+    }
 
     run: str = Field("", description="name of the run; empty: a time stamp. runs/latest points to it")
     recipe: str = Field(
@@ -55,6 +62,9 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     panel: Literal["auto", "on", "off"] = Field(
         "auto", description="live terminal panel, in place of lines of progress; auto: if there is a terminal"
     )
+    json_line: bool = Field(
+        False, alias="json", exclude=True, description="print the run's summary as one JSON object, last line"
+    )
     watchdog_s: float = Field(
         60.0,
         ge=0,
@@ -76,3 +86,34 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
     def _stages_have_a_budget(self) -> Self:
         self.learner.curriculum.check_budget(self.frames)
         return self
+
+
+def settings(argv: Sequence[str], prog: str) -> DeployConfig:
+    """Return the settings of a run; a resumed one has those of its config.toml, except for flags given now."""
+    asked = first_look(DeployConfig, ("run", "resume"), argv, prog=prog, section=SECTION)
+    if not asked.resume:
+        if asked.run == LATEST:
+            raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
+        return load(DeployConfig, argv, prog=prog, section=SECTION, recipes=RECIPES)
+    if not asked.run:
+        newest = f": the newest run is {found}" if (found := newest_run()) else ""
+        raise ConfigError(f"--resume needs --run NAME{newest}")
+    name = (newest_run() or LATEST) if asked.run == LATEST else asked.run
+    file = RunFolder.of(name).config
+    if not file.exists():
+        raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
+    own = read_toml(file).get(SECTION)
+    if own is None:
+        raise ConfigError(
+            f"run {name!r} was started service by service: {file} has no table [{SECTION}]; go on with: "
+            f"python -m services.learner --run {name} --resume"
+        )
+    # The file has every setting, those of its recipe too
+    resumed = load(DeployConfig, argv, prog=prog, section=SECTION, recorded=file)
+    recipe = own.get("recipe", "")
+    if resumed.recipe not in ("", recipe):
+        raise ConfigError(
+            f"--recipe {resumed.recipe} with --resume: run {name!r} started with "
+            f"{f'recipe {recipe}' if recipe else 'no recipe'}; allowed: no --recipe"
+        )
+    return resumed.model_copy(update={"run": name})

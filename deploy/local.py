@@ -1,233 +1,26 @@
-"""`python -m deploy.local`: a whole run on this machine; starts every process and watches them."""
+"""`python -m deploy.local`, and `topspin train`: a whole run on this machine."""
 
-import json
-import logging
+# ruff: noqa: PLC0415 - what a run needs is imported after its flags are read: --help answers at once
+
 import os
 import sys
-import time
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
 from threading import Event
-from typing import Any, Final
+from typing import Final
 
-from rich.console import Console
-from rich.live import Live
-
-from common.comms.messages import Status
-from common.comms.transport import Transport, TransportError
-from common.evaluation.evaluate import StoppedError, check, measure
-from common.evaluation.match import MatchConfig
-from common.policy.folder import load_policy
-from common.service.log import set_up_logging
-from common.service.process import DONE, INTERRUPTED, run_service
-from common.service.run_folder import RunFolder
-from common.service.whole_file import write_whole
-from deploy.panel import View, render
-from deploy.prepare import PreparedRun, RunFailedError, last_epoch, open_link, prepared, settings
-from deploy.supervisor import Supervisor
-from deploy.targets import TargetsFile
-from deploy.watchdog import Watchdog
-from deploy.watcher import Watcher
-from services.learner.budget import NOTHING_LEFT
-
-log = logging.getLogger(__name__)
+from common.service.process import run_service
+from deploy.config import settings
 
 PROG: Final = "python -m deploy.local"
-WATCH_S: Final = 0.25
-LEARNER_PATIENCE_S: Final = 30.0  # time to write a checkpoint
-WORKER_PATIENCE_S: Final = 12.0  # time for an actor to finish its rollout and get the last verdicts
-LEARNER: Final = "learner-0"
-LOG_FILE: Final = "deploy.log"
-FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")
-
-
-class _Ended(Event):
-    """Set when a stop is requested, or when the learner has ended before it listened."""
-
-    def __init__(self, stop: Event, supervisor: Supervisor) -> None:
-        super().__init__()
-        self._stop, self._supervisor = stop, supervisor
-
-    def is_set(self) -> bool:
-        self._supervisor.watch(time.monotonic())
-        return self._stop.is_set() or self._supervisor.has_ended(LEARNER)
-
-
-def run_summary(run: PreparedRun, learner: Status | None) -> dict[str, Any]:
-    """Return a run's summary, from its folder and from the learner's last heartbeat."""
-    contract = load_policy(run.folder.latest_policy).contract
-    counters = learner.counters if learner else {}
-    return {
-        "run": run.name,
-        "policy": str(run.folder.latest_policy),
-        "frames": contract.frames,
-        "stage": contract.stage,
-        "seconds": trained_seconds(run.folder),
-        "ledger": {name: int(counters[name]) for name in FATES if name in counters},
-    }
-
-
-def trained_seconds(folder: RunFolder) -> float:
-    """Return the time from the first trained batch to the last, through restarts [s]."""
-    return round(float(last_epoch(folder).get("seconds", 0.0)), 1)
-
-
-def final_measures(run: PreparedRun, stop: Event) -> dict[str, Any]:
-    """Return the measures of the final policy; {} if a stop was requested.
-
-    Launch preset and randomization are the same for every run; contacts and perception are the run's.
-    """
-    folder, task = run.folder.latest_policy, run.config.task
-    config = MatchConfig(
-        rallies=run.config.final_rallies,
-        seed=run.config.seed,
-        envs=run.config.evaluator.envs,
-        rounds=run.config.evaluator.rounds,
-        perception=task.perception,
-        collision=task.collision,
-        time_limit_s=task.time_limit_s,
-    )
-    log.info("measuring the final policy rallies=%d", config.rallies)
-    try:
-        measured = measure(load_policy(folder), folder, config, lambda: check(stop))
-    except StoppedError:
-        return {}
-    for detail in ("policy", "by", "by_round"):
-        measured.pop(detail, None)
-    measured["evaluation_seconds"] = measured.pop("seconds")
-    return measured
-
-
-def shows_panel(wanted: str, console: Console) -> bool:
-    """Return whether the panel can be shown, and is wanted; lines of progress are logged where it is not."""
-    if console.is_dumb_terminal:  # it can't move its cursor
-        return False
-    # The person's environment may call a file a terminal, or a terminal a file
-    is_terminal = console.file.isatty() and console.is_terminal and console.is_interactive
-    return wanted == "on" or (wanted == "auto" and is_terminal)
-
-
-def watch(
-    run: PreparedRun, view: View, transport: Transport, watcher: Watcher, supervisor: Supervisor, stop: Event
-) -> None:
-    """Keep the processes alive and show their state, until the learner ends or ``stop`` is set."""
-    console = Console(stderr=True)
-    has_panel = shows_panel(run.config.panel, console)
-    log_file = run.folder.logs / LOG_FILE
-    with ExitStack() as stack:
-        live = stack.enter_context(Live(console=console, auto_refresh=False)) if has_panel else None
-        # a panel has replaced stderr: log to the new one
-        set_up_logging("info", "deploy", log_file)
-        watchdog = Watchdog(LEARNER, run.config.watchdog_s)
-        targets = stack.enter_context(
-            closing(TargetsFile(run.folder.targets, run.name, run.config.metrics_host))
-        )
-        while not stop.is_set() and not supervisor.has_ended(LEARNER):
-            now = time.monotonic()
-            supervisor.watch(now)
-            watcher.look(now)
-            targets.update(view.statuses.values(), supervisor.children)
-            end_hung(watchdog, supervisor, view, now)
-            view.restarts = {name: child.restarts for name, child in supervisor.children.items()}
-            if name := supervisor.has_bad_config():
-                raise RunFailedError(f"{name} can't use its settings: {supervisor.last_line(name)}")
-            if live is not None:
-                live.update(render(view, now), refresh=True)
-            else:
-                watcher.line(now)
-            transport.wait(WATCH_S)
-            stop.wait(0.05)  # heartbeats of many services must not keep this loop busy
-    set_up_logging("info", "deploy", log_file)
-
-
-def end_hung(watchdog: Watchdog, supervisor: Supervisor, view: View, now: float) -> None:
-    """Kill the processes that hang; the supervisor starts them again."""
-    running = [
-        (name, child.process.pid, child.started)
-        for name, child in supervisor.children.items()
-        if child.process.poll() is None
-    ]
-    heard = {f"{role}-{id_}": when for (role, id_), when in view.heard.items()}
-    for name in watchdog.look(running, heard, now):
-        log.warning(
-            "process hangs name=%s: no heartbeat and no CPU time for %.0f s; killing it",
-            name,
-            watchdog.limit_s,
-        )
-        supervisor.kill(name)
-
-
-def end(supervisor: Supervisor, stop: Event) -> None:
-    """End all processes. In an interrupted run the actors end first, while the learner still answers."""
-    workers = [name for name in supervisor.children if name != LEARNER]
-    if stop.is_set():
-        supervisor.stop(workers, WORKER_PATIENCE_S)
-    supervisor.stop([LEARNER], LEARNER_PATIENCE_S)
-    supervisor.stop(workers, WORKER_PATIENCE_S)
-
-
-def run_prepared(run: PreparedRun, stop: Event, prog: str) -> int:
-    """Run a prepared run; return the exit status: 0 only if the learner finished."""
-    config, folder = run.config, run.folder
-    set_up_logging("info", "deploy", folder.logs / LOG_FILE)
-    log.info(
-        "run=%s folder=%s endpoint=%s actors=%d", run.name, folder.root, run.link.endpoint, config.actors
-    )
-    if done := run.spent():  # the learner then ends at once, and its policy is measured
-        log.warning(NOTHING_LEFT, done, "learner.")
-    view = View(run.name, minutes=config.minutes, frames=config.frames)
-    supervisor = Supervisor(run.specs(), folder.logs)
-    try:
-        transport = connect(run, stop, supervisor)
-        if transport is not None:
-            with closing(transport):
-                watcher = Watcher(view, transport)
-                watch(run, view, transport, watcher, supervisor, stop)
-                end(supervisor, stop)
-                watcher.look(time.monotonic())  # the learner's last heartbeat
-    finally:
-        end(supervisor, stop)
-    return conclude(run, supervisor, view.statuses.get(("learner", "0")), stop, prog)
-
-
-def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, stop: Event, prog: str) -> int:
-    """Measure the final policy, print the run's one line, and return the exit status."""
-    again = f"{prog} --run {run.name} --resume"
-    status = supervisor.status_of(LEARNER)
-    if stop.is_set() and not run.folder.latest_policy.exists():
-        log.warning("stopped before anything was learned; start again with: %s", again)
-        return INTERRUPTED
-    if status != DONE:
-        advice = f"; go on with: {again}" if run.newest_checkpoint() else ""
-        raise RunFailedError(
-            f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}"
-        )
-    line = run_summary(run, learner)
-    if run.config.evaluate and not stop.is_set():
-        line |= final_measures(run, stop)
-    text = json.dumps(line) + "\n"
-    sys.stdout.write(text)
-    write_whole(run.folder.final, text)
-    if stop.is_set():
-        log.warning("stopped before its end; go on with: %s", again)
-        return INTERRUPTED
-    return DONE
-
-
-def connect(run: PreparedRun, stop: Event, supervisor: Supervisor) -> Transport | None:
-    """Return a connection to the learner, or None if it ended, or a stop was requested, before it listened."""
-    ended = _Ended(stop, supervisor)
-    try:
-        return open_link(run, ended)
-    except TransportError:
-        if ended.is_set():
-            return None
-        raise
 
 
 def main(argv: Sequence[str], stop: Event, prog: str = PROG) -> int:
     """Run from the command line; return the exit status."""
     config = settings(argv, prog)
+    from common.service.log import set_up_logging
+    from deploy.prepare import prepared
+    from deploy.run import run_prepared
+
     set_up_logging("info", "deploy")
     with prepared(config) as run:
         return run_prepared(run, stop, prog)

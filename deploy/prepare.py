@@ -3,12 +3,11 @@
 import errno
 import itertools
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import datetime
 from threading import Event
-from typing import Final
 
 from pydantic import ValidationError
 
@@ -18,17 +17,16 @@ from common.comms.roles import OPERATOR_NAME, name_of
 from common.comms.transport import Transport
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.errors import ReportedError
-from common.service.config import ConfigError, first_look, load, read_toml, save_settings, to_tables
+from common.errors import ConfigError, ReportedError
+from common.service.config import save_settings, to_tables
+from common.service.config_sources import read_toml
 from common.service.endpoint import PORTS_TRIED
-from common.service.run_folder import LATEST, LOCKS, RUNS, RunFolder, newest_run
+from common.service.run_folder import LOCKS, RUNS, RunFolder
 from common.service.table import whole_rows
-from deploy.config import CONNECT_S, RECIPES, DeployConfig
+from deploy.config import CONNECT_S, SECTION, DeployConfig
 from deploy.supervisor import Spec
 from deploy.topology import ROLES, Role
 from services.learner.budget import ENDING_S, Budget
-
-SECTION: Final = "local"
 
 
 class RunFailedError(ReportedError):
@@ -54,8 +52,11 @@ class PreparedRun:
 
     def spent(self) -> str:
         """Return the limit that a resumed run had reached before, such as "10 of 10 minutes", or ""."""
-        last = self.last_epoch()
-        if not (self.config.resume and last):
+        return self.spent_by(self.last_epoch()) if self.config.resume else ""
+
+    def spent_by(self, last: Mapping[str, str]) -> str:
+        """Return the limit that the run reached with its epoch ``last``, a row of metrics.csv, or ""."""
+        if not last:
             return ""
         budget = Budget(self.config.learner.curriculum.epochs, self.config.frames, self.config.minutes)
         return budget.spent(int(last["epoch"]), int(last["frames"]), float(last["seconds"]), ENDING_S)
@@ -137,37 +138,6 @@ def free_port() -> int:
 def free_endpoint(kind: str = "tcp") -> str:
     """Return a free endpoint on the loopback interface."""
     return f"{kind}/127.0.0.1:{free_port()}"
-
-
-def settings(argv: Sequence[str], prog: str) -> DeployConfig:
-    """Return the settings of a run; a resumed one has those of its config.toml, except for flags given now."""
-    asked = first_look(DeployConfig, ("run", "resume"), argv, prog=prog, section=SECTION)
-    if not asked.resume:
-        if asked.run == LATEST:
-            raise ConfigError(f"run {LATEST!r} is the name of the newest run; choose another --run")
-        return load(DeployConfig, argv, prog=prog, section=SECTION, recipes=RECIPES)
-    if not asked.run:
-        newest = f": the newest run is {found}" if (found := newest_run()) else ""
-        raise ConfigError(f"--resume needs --run NAME{newest}")
-    name = (newest_run() or LATEST) if asked.run == LATEST else asked.run
-    file = RunFolder.of(name).config
-    if not file.exists():
-        raise ConfigError(f"run {name!r} can't be resumed: there is no {file}")
-    own = read_toml(file).get(SECTION)
-    if own is None:
-        raise ConfigError(
-            f"run {name!r} was started service by service: {file} has no table [{SECTION}]; go on with: "
-            f"python -m services.learner --run {name} --resume"
-        )
-    # The file has every setting, those of its recipe too
-    resumed = load(DeployConfig, argv, prog=prog, section=SECTION, recorded=file)
-    recipe = own.get("recipe", "")
-    if resumed.recipe not in ("", recipe):
-        raise ConfigError(
-            f"--recipe {resumed.recipe} with --resume: run {name!r} started with "
-            f"{f'recipe {recipe}' if recipe else 'no recipe'}; allowed: no --recipe"
-        )
-    return resumed.model_copy(update={"run": name})
 
 
 @contextmanager

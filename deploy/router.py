@@ -3,6 +3,7 @@
 The learner then is a client (`--mode client`): when it starts again, no other service loses its link.
 """
 
+# ruff: noqa: PLC0415 - what the router runs on is imported after its flags are read: --help answers at once
 import logging
 import sys
 import time
@@ -14,11 +15,9 @@ from typing import ClassVar, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from common.comms.zenoh_config import ZenohConfig
-from common.comms.zenoh_transport import open_zenoh
 from common.service.config import load
 from common.service.endpoint import FIRST_PORT
 from common.service.log import set_up_logging
-from common.service.metrics import Metrics
 from common.service.process import DONE, run_service
 from common.service.settings import LogLevel
 
@@ -34,7 +33,9 @@ class RouterConfig(ZenohConfig):
     It has no state. Services connect again when it comes back.
     """
 
-    often: ClassVar = ("endpoint", "metrics_host", "metrics_port")
+    often: ClassVar = {
+        "Where it listens": ("endpoint", "metrics_host", "metrics_port"),
+    }
 
     mode: Literal["hub"] = Field("hub", exclude=True, description="a router listens")
     run: str = Field("", description="label of its metrics: it may serve many runs")
@@ -57,6 +58,9 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Pass messages on until ``stop`` is set; return the exit status."""
     config = load(RouterConfig, argv, prog=PROG, section="router")
     set_up_logging(config.log_level, "router")
+    from common.comms.zenoh_transport import open_zenoh
+    from common.service.metrics import Metrics
+
     with closing(Metrics("router", "0", config.run)) as metrics:
         port = metrics.serve(config.metrics_port, config.metrics_host)
         log.info("serving metrics url=http://%s:%d/metrics", config.metrics_host, port)

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from common.service.config import ENVIRONMENT_PREFIX
+from common.service.config_sources import ENVIRONMENT_PREFIX
 from common.service.process import BAD_CONFIG, DONE
 from deploy.child import SPARE, Assignment
 

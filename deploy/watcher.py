@@ -9,7 +9,7 @@ from common.comms.keys import KeyPartError, Keys
 from common.comms.messages import Status
 from common.comms.transport import Transport
 from common.service.member import RefusalLog
-from deploy.panel import STALE_S, View, clock, time_left_s
+from deploy.panel import STALE_S, View, clock, time_left_s, written
 
 log = logging.getLogger(__name__)
 
@@ -53,18 +53,18 @@ class Watcher:
         evaluated = measured.gauges if measured else {}
         alive = sum(now - heard < STALE_S for heard in self._view.heard.values())
         log.info(
-            "progress stage=%d frames=%d frames_per_s=%.0f catch=%.3f return=%.3f error=%.2f reward=%.1f lag=%.2f "
-            "evaluation_catch=%.3f evaluation_return=%.3f alive=%d left=%s",
+            "progress stage=%d frames=%d frames_per_s=%.0f catch=%s return=%s error=%s reward=%s lag=%s "
+            "evaluation_catch=%s evaluation_return=%s alive=%d left=%s",
             g.get("stage", 0),
             c.get("frames", 0),
             g.get("frames_per_s", 0),
-            g.get("catch_rate", float("nan")),
-            g.get("return_rate", float("nan")),
-            g.get("target_error", float("nan")),
-            g.get("reward", float("nan")),
-            g.get("lag", float("nan")),
-            evaluated.get("catch_rate", float("nan")),
-            evaluated.get("return_rate", float("nan")),
+            written(g, "catch_rate", ".3f"),
+            written(g, "return_rate", ".3f"),
+            written(g, "target_error", ".2f"),
+            written(g, "reward", ".1f"),
+            written(g, "lag", ".2f"),
+            written(evaluated, "catch_rate", ".3f"),
+            written(evaluated, "return_rate", ".3f"),
             alive,
             clock(time_left_s(self._view)),
         )

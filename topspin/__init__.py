@@ -6,9 +6,9 @@ Importing this package registers ``topspin/Rally-v0`` for Gymnasium. It offers
     topspin.Observer, topspin.BallSample    what a policy observes, from what a robot measures
 """
 
+import os
+import sys
 from typing import TYPE_CHECKING, Any
-
-from topspin.gym_ids import register_envs
 
 if TYPE_CHECKING:
     from common.rally.observer import BallSample
@@ -17,7 +17,18 @@ if TYPE_CHECKING:
 
 __all__ = ["BallSample", "Observer", "load_policy"]
 
-register_envs()
+
+def _is_the_command() -> bool:
+    """Return whether this process is the `topspin` command, which has no use for Gymnasium: it loads for 0.15 s."""
+    words = sys.orig_argv
+    module = words[words.index("-m") + 1 :][:1] if "-m" in words else []
+    return module == ["topspin"] or [os.path.basename(path) for path in sys.argv[:1]] == ["topspin"]
+
+
+if not _is_the_command():
+    from topspin.gym_ids import register_envs
+
+    register_envs()
 
 
 def __getattr__(name: str) -> Any:  # torch takes seconds to import: only when it is needed

@@ -5,11 +5,10 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from threading import Event
 from typing import Final
 
-from common.service.config import ConfigError, HelpRequest
+from common.errors import ConfigError, HelpRequest
 from common.service.process import run_service
 
 # A command imports what it needs when it runs: `topspin --help` answers at once.
@@ -120,6 +119,8 @@ def dispatch(argv: Sequence[str], stop: Event) -> int:
     if name in ("-h", "--help", "help"):
         raise HelpRequest(usage())
     if name == "--version":
+        from importlib.metadata import version
+
         raise HelpRequest(f"topspin {version('topspin')}\n")
     if name not in COMMANDS:
         nearest = difflib.get_close_matches(name, COMMANDS, n=1, cutoff=0.5)

@@ -30,7 +30,11 @@ class CertsConfig(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    often: ClassVar = ("out", "actors", "generators", "add", "hosts", "days")
+    often: ClassVar = {
+        "Where": ("out",),
+        "For whom": ("actors", "generators", "add"),
+        "Validity": ("hosts", "days"),
+    }
 
     out: str = Field("certs", description="folder to write into; a file in it is never overwritten")
     actors: int = Field(

@@ -8,7 +8,7 @@ import numpy as np
 from common.env.local_rallies import LocalRallies
 from common.env.rally_env import RallyEnv
 from common.evaluation.unplayed_flight import unplayed_flight
-from common.physics.flight import Flight
+from common.physics.flight_model import Flight
 from common.task.config import TaskConfig
 from common.task.launch import LAUNCH_SIZE
 from common.task.randomization import RALLY_PARAMETERS

@@ -1,15 +1,14 @@
 """`topspin evaluate`: measure a policy on fixed rallies."""
 
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
+
 from collections.abc import Sequence
 from threading import Event
 from typing import ClassVar, Final
 
 from pydantic import Field
 
-from common.evaluation.evaluate import check, measure, print_measures
-from common.evaluation.match import MatchConfig
-from common.policy.box import policy_folder
-from common.policy.folder import load_policy
+from common.evaluation.config import MatchConfig
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
@@ -24,10 +23,11 @@ class EvaluateConfig(MatchConfig):
     Robot, control rate, observation and flight are those of the policy's contract.
     """
 
-    often: ClassVar = (
-        *("policy", "rallies", "launch", "rounds", "randomization", "perception"),
-        *("collision", "expected_spin", "seed", "json"),
-    )
+    often: ClassVar = {
+        "The policy": ("policy", "expected_spin"),
+        "The rallies": ("rallies", "launch", "rounds", "randomization", "perception", "collision", "seed"),
+        "The result": ("json",),
+    }
 
     policy: str = Field("default", description="a policy of the box, or a policy folder")
     json_line: bool = Field(
@@ -40,6 +40,10 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and print; return the exit status."""
     config = load(EvaluateConfig, argv, prog=PROG, section="evaluate")
     set_up_logging(config.log_level, "evaluate")
+    from common.evaluation.evaluate import check, measure, print_measures
+    from common.policy.box import policy_folder
+    from common.policy.folder import load_policy
+
     folder = policy_folder(config.policy)
     found = measure(load_policy(folder), folder, config, lambda: check(stop))
     print_measures(found, config.json_line)

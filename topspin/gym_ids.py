@@ -1,4 +1,4 @@
-"""The Gymnasium ids of the environments; ``gymnasium.make`` finds them through the plugin entry point too."""
+"""The Gymnasium ids of the environments."""
 
 from typing import Final
 

@@ -1,5 +1,7 @@
 """`topspin pictures`: stills of a policy's best rally, for the README."""
 
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
+
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,16 +10,12 @@ from typing import ClassVar, Final
 
 from pydantic import Field
 
-from common.evaluation.match import MatchConfig, evaluation_rallies, match_task
-from common.evaluation.rally_recorder import record_rallies
-from common.policy.box import policy_folder
-from common.policy.folder import load_policy
+from common.evaluation.config import MatchConfig
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from common.service.settings import LogLevel
-from topspin.render.options import Camera
-from topspin.render.stills import rally_picture, rally_strip, save_png, showpiece
+from topspin.render.config import Camera
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +27,10 @@ STRIP_SIZE: Final = (312, 240)  # [pixels] of each part
 class PicturesConfig(MatchConfig):
     """Draw stills of a policy's best rally among the first fixed ones."""
 
-    often: ClassVar = ("policy", "out", "rallies", "camera", "launch", "randomization", "seed")
+    often: ClassVar = {
+        "What is drawn": ("policy", "out", "camera"),
+        "The rallies": ("rallies", "launch", "randomization", "seed"),
+    }
 
     policy: str = Field("default", description="a policy of the box, or a policy folder")
     out: str = Field("docs/pictures", description="folder to write rally.png and strip.png into")
@@ -42,6 +43,12 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Draw the pictures; return the exit status."""
     config = load(PicturesConfig, argv, prog=PROG, section="pictures")
     set_up_logging(config.log_level, "pictures")
+    from common.evaluation.match import evaluation_rallies, match_task
+    from common.evaluation.rally_recorder import record_rallies
+    from common.policy.box import policy_folder
+    from common.policy.folder import load_policy
+    from topspin.render.stills import rally_picture, rally_strip, save_png, showpiece
+
     policy = load_policy(policy_folder(config.policy))
     task = match_task(policy.contract, config, config.expected_spin)
     rallies = evaluation_rallies(config.rallies, task, config.seed)

@@ -1,5 +1,7 @@
 """`topspin play`: measure a policy on fixed rallies, and film the first of them."""
 
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
+
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,17 +10,12 @@ from typing import ClassVar, Final
 
 from pydantic import Field
 
-from common.evaluation.evaluate import check, measure, print_measures
-from common.evaluation.match import MatchConfig, evaluation_rallies, match_task
-from common.evaluation.rally_recorder import record_rallies
-from common.policy.box import policy_folder
-from common.policy.folder import load_policy
+from common.evaluation.config import MatchConfig
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from common.service.settings import LogLevel
-from topspin.render.film import check_tools
-from topspin.render.options import FilmConfig, film
+from topspin.render.config import FilmConfig
 
 PROG: Final = "topspin play"
 
@@ -29,10 +26,12 @@ class PlayConfig(MatchConfig, FilmConfig):
     Robot, control rate, observation and flight are those of the policy's contract.
     """
 
-    often: ClassVar = (
-        *("policy", "video", "rallies", "film_rallies", "launch", "rounds"),
-        *("randomization", "camera", "slow", "json"),
-    )
+    often: ClassVar = {
+        "What plays": ("policy",),
+        "The rallies": ("rallies", "launch", "rounds", "randomization"),
+        "The film": ("video", "film_rallies", "camera", "slow"),
+        "The result": ("json",),
+    }
 
     policy: str = Field("default", description="a policy of the box, or a policy folder")
     video: str = Field("runs/play.mp4", pattern=r"\.mp4$", description="film to write, H.264")
@@ -47,6 +46,13 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and film; return the exit status."""
     config = load(PlayConfig, argv, prog=PROG, section="play")
     set_up_logging(config.log_level, "play")
+    from common.evaluation.evaluate import check, measure, print_measures
+    from common.evaluation.match import evaluation_rallies, match_task
+    from common.evaluation.rally_recorder import record_rallies
+    from common.policy.box import policy_folder
+    from common.policy.folder import load_policy
+    from topspin.render.film import check_tools, film
+
     started = time.monotonic()
     folder = policy_folder(config.policy)
     policy = load_policy(folder)

@@ -1,4 +1,6 @@
-"""`topspin release`: put a policy into the box, assets/policies/NAME, with its measures."""
+"""`topspin release`: put a policy into the box, common/policies/NAME, with its measures."""
+
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
 
 import json
 import logging
@@ -10,14 +12,11 @@ from typing import Any, ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.evaluation.evaluate import check, measure
-from common.evaluation.match import DEFAULT_ENVS, Environments, MatchConfig, MatchSpin
+from common.evaluation.config import DEFAULT_ENVS, Environments, MatchConfig, MatchSpin
 from common.policy.box import BOX, policy_folder
-from common.policy.folder import load_policy, mean_policy, save_policy
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
-from topspin.report.provenance import commit_of
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +35,10 @@ class ReleaseConfig(BaseModel):
     """Measure a policy on every exam and put it, with the measures in its contract, into the box."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-    often: ClassVar = ("policy", "name", "rallies", "seed", "envs", "expected_spin", "box")
+    often: ClassVar = {
+        "The policy": ("policy", "name", "box"),
+        "The exams": ("rallies", "seed", "envs", "expected_spin"),
+    }
 
     policy: str = Field(
         "runs/latest/policy/best",
@@ -55,6 +57,10 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and write; return the exit status."""
     config = load(ReleaseConfig, argv, prog=PROG, section="release")
     set_up_logging("info", "release")
+    from common.evaluation.evaluate import check, measure
+    from common.policy.folder import load_policy, mean_policy, save_policy
+    from topspin.report.provenance import commit_of
+
     policies = [load_policy(policy_folder(given)) for given in config.policy.split(",")]
     policy = mean_policy(policies) if len(policies) > 1 else policies[0]
     contract = policy.contract.expecting(config.expected_spin)

@@ -12,9 +12,11 @@ from typing import Any, Final, cast
 
 from common.comms.messages import Rollout, Verdict
 from services.actor import outbox as box
-from services.actor.outbox import Outbox, OutboxConfig
+from services.actor.config import OutboxConfig
+from services.actor.outbox import Outbox
 from services.learner.admission import Header, LearnerState
-from services.learner.intake import Intake, IntakeConfig
+from services.learner.config import IntakeConfig
+from services.learner.intake import Intake
 
 ACTORS: Final = ("a", "b")
 LIFE: Final = 1

@@ -13,20 +13,20 @@ import numpy as np
 from benchmarks.fuzz.message_examples import EXAMPLES
 from common.comms.codec import DecodeError, decode, encode
 from common.comms.messages import MESSAGES
-from common.policy.actor_critic import NetworkConfig
-from common.policy.contract import PolicyError, contract_of
-from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, load_policy, save_policy
-from common.service.config import ConfigError, read_toml, save_settings, to_tables
+from common.errors import ConfigError
+from common.policy.config import NetworkConfig
+from common.policy.contract import CONTRACT_FILE, WEIGHTS_FILE, PolicyError, contract_of
+from common.policy.folder import load_policy, save_policy
+from common.service.config import save_settings, to_tables
+from common.service.config_sources import read_toml
 from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
-from deploy.config import DeployConfig
-from deploy.prepare import SECTION
+from deploy.config import SECTION, DeployConfig
 from services.learner import checkpoint
 from services.learner.admission import open_rollout
 from services.learner.checkpoint import CheckpointError, Extras
-from services.learner.curriculum import CurriculumConfig
-from services.learner.ppo import PPOConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.training import Training
 from topspin.real2sim.formats.recordings import load
 from topspin.real2sim.formats.tracks import RecordingError

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from common.errors import ReportedError
+from common.errors import ConfigError
 
 CA: Final = "ca"
 HUB_ROLE: Final = "learner"
@@ -35,7 +35,7 @@ SKEW: Final = timedelta(hours=1)  # clocks of hosts may differ by so much
 ANSWER_S: Final = 2.0  # [s] longest wait for the other side's verdict on a certificate
 
 
-class CertificateError(ReportedError, ValueError):
+class CertificateError(ConfigError):
     """A certificate that can't be used or made: one line with the file, and what is allowed."""
 
 

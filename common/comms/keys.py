@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from common.comms.budgets import ID_PATTERN, one_line
-from common.errors import ReportedError
+from common.errors import ConfigError
 
 PREFIX: Final = "topspin/v2"
 ROLES: Final = ("generator", "actor", "learner", "evaluator")
@@ -31,7 +31,7 @@ _PART: Final = re.compile(ID_PATTERN)
 LONGEST_NUMBER: Final = 19  # digits of an incarnation: it fits into 64 bits
 
 
-class KeyPartError(ReportedError, ValueError):
+class KeyPartError(ConfigError):
     """A run, role, id or number that is not allowed in a key."""
 
 

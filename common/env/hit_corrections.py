@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.env.robot import RobotBatch
-from common.physics.flight import Flight
+from common.physics.flight_model import Flight
 from common.rally.hit_correction import BACK, DriveHistories, corrections
 from common.rally.state import Rallies, RobotMotion
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from common.errors import ReportedError
 from common.evaluation.breakdown import breakdown, survival, table
-from common.evaluation.match import MatchConfig, environments, evaluation_rallies, match_task, play_match
+from common.evaluation.config import MatchConfig
+from common.evaluation.match import environments, evaluation_rallies, match_task, play_match
 from common.evaluation.measures import measures
 from common.evaluation.robot_measures import robot_measures
 from common.policy.folder import Policy

@@ -1,53 +1,27 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
 
 from common.env.rally_env import FinishedRallies, Launches, RallyEnv, RallySource
+from common.evaluation.config import DEFAULT_ENVS, MatchSpin
 from common.evaluation.measures import MatchResult
 from common.evaluation.opponents import FILLED, FilledDeck, OpponentRallies, in_equal_batches
 from common.evaluation.robot_measures import RobotMonitor
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.policy.contract import Contract
 from common.policy.folder import Policy
-from common.task.config import MatchConditions, PlayConditions, TaskConfig
+from common.task.config import PlayConditions, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import Purpose, RallyBlock, draw_rallies
-from common.task.observation import ExpectedSpin
 from common.task.randomization import RallyParameter, RandomizationProfile
 
-DEFAULT_ENVS: Final = 250
 EPISODES_EACH: Final = 4  # each environment has rallies for at least so many whole episodes
 
 # Settings of every command that plays a match
-Environments = Annotated[
-    int,
-    Field(
-        ge=1,
-        le=65536,
-        description="environments played together; each plays rallies / envs balls of the same opponent",
-    ),
-]
-MatchSpin = Annotated[
-    ExpectedSpin | Literal["contract"],
-    Field(
-        description="spin that the robot expects (task.observation.expected_spin): mild, mixed, strong or learnt; "
-        "contract: as the policy's contract says"
-    ),
-]
-
-
-class MatchConfig(MatchConditions):
-    """A match: fixed rallies, and the conditions of play."""
-
-    rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to play")
-    seed: int = Field(20260, ge=0, lt=2**63, description="seed of the rallies")
-    envs: Environments = DEFAULT_ENVS
-    expected_spin: MatchSpin = "contract"
 
 
 def match_task(

@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from common.jit import kernel
 from common.physics.constants import GRID_STEP, TABLE_HALF_LENGTH
-from common.physics.flight import Air, Flight, flight_step
+from common.physics.flight import Air, flight_step
+from common.physics.flight_model import Flight
 from common.physics.fly import NO_ROBOT, RobotPath, fly_step, fly_to_touch
 from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, ROBOT_COURT

@@ -7,23 +7,14 @@ error of the landing is 40 mm with the simple model and 35 mm with the full one.
 lift that never saturates 65 mm.
 """
 
-from enum import IntEnum
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from common.jit import kernel
 from common.physics.constants import AIR_FACTOR, AIR_VOLUME_FACTOR, BALL_RADIUS, GRAVITY
+from common.physics.flight_model import Flight
 from common.physics.vec import Vec, axpy, cross, norm
-
-
-class Flight(IntEnum):
-    """Model of the aerodynamic coefficients."""
-
-    SIMPLE = 0
-    FULL = 1
-    LINEAR = 2  # the simple model's form with coefficients fitted to the full one: what an observer assumes
-
 
 SIMPLE: Final = int(Flight.SIMPLE)  # kernels compare plain integers
 FULL: Final = int(Flight.FULL)

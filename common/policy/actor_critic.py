@@ -6,14 +6,12 @@ critic; Pinto et al. 2018, "Asymmetric actor critic for image-based robot learni
 
 import math
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
 import torch
-from annotated_types import Ge, Le
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
+from common.policy.config import NetworkConfig
 from common.policy.d2rl import D2RL
 from common.policy.normalizer import Moments, scale_of
 
@@ -22,20 +20,6 @@ CRITIC_HEAD_UNITS = (
     64,
 )  # hidden layers of a privileged critic: from the trunk's output and the truth to the value
 LOG_2_PI = math.log(2.0 * math.pi)
-
-
-class NetworkConfig(BaseModel):
-    """The network's shape and start."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    units: tuple[Annotated[int, Ge(1), Le(4096)], ...] = Field(
-        (256, 128, 128, 64, 64, 32),
-        min_length=1,
-        max_length=16,
-        description="widths of the D2RL trunk's hidden layers",
-    )
-    initial_log_std: float = Field(-1.6, ge=-5, le=1, description="log of the action noise at the start")
 
 
 class ActorCritic(nn.Module):

@@ -1,13 +1,13 @@
 """The box: trained policies that come with the project, found by name from any working directory."""
 
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from common.policy.contract import PolicyError
-from common.policy.folder import CONTRACT_FILE
+from common.policy.contract import CONTRACT_FILE, PolicyError
 from common.service.run_folder import LATEST, RUNS, RunFolder
 
-BOX: Final = Path(__file__).resolve().parents[2] / "assets" / "policies"
+BOX: Final = Path(str(files("common"))).resolve() / "policies"
 
 
 def names() -> list[str]:

@@ -8,12 +8,13 @@ from typing import Any, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import ReportedError
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import ACTION, ExpectedSpin, ObservationConfig, Part, policy_layout
 
 FORMAT: Final = 2
+WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"  # of a policy folder
 
 
 class PolicyError(ReportedError, ValueError):

@@ -23,13 +23,12 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from common.policy.actor_critic import ActorCritic
-from common.policy.contract import Contract, PolicyError, described, same_numbers
+from common.policy.contract import CONTRACT_FILE, WEIGHTS_FILE, Contract, PolicyError, described, same_numbers
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import load_state, new_network, observation_moments, state_tensors
 from common.service.whole_file import write_whole
 from common.task.observation import ACTION, ACTION_SIZE, offsets, policy_layout, size
 
-WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"
 _ACTING: Final = ("trunk.", "mean.", "log_std")  # the policy's parameters; the others are the critic's
 _OBS_MEAN, _OBS_VAR, _OBS_COUNT = "obs_moments.mean", "obs_moments.var", "obs_moments.count"
 _MOMENTS: Final = (_OBS_MEAN, _OBS_VAR, _OBS_COUNT)

@@ -11,7 +11,8 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from common.comms.messages import PolicySnapshot
-from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.actor_critic import ActorCritic
+from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError
 from common.policy.normalizer import Moments
 from common.task.observation import (

@@ -26,6 +26,7 @@ _TYPE_WORDS: Final = {
 }
 
 
+WIDTH: Final = 80  # columns, or fewer where the terminal has fewer
 _TEXT_COLUMN: Final = 26
 _MOST_DIGITS: Final = 19  # of a setting: none is above 2^63
 
@@ -104,24 +105,30 @@ def format_help(
 
     Args:
         prog: How the program is called.
-        model: Its docstring says what the program does; its ``often`` names the settings that people change.
+        model: Its docstring says what the program does; its ``often`` names the settings that people change, in
+            groups with a title. All settings are grouped by their tables.
         settings: All settings.
         variable: Example of a setting's name in the environment.
         every: Whether all settings are listed.
     """
-    often: Sequence[str] = getattr(model, "often", ())
-    shown = settings if every or not often else {path: settings[path] for path in often}
-    width = shutil.get_terminal_size((80, 24)).columns
+    often: Mapping[str, Sequence[str]] = getattr(model, "often", {})
+    groups = _by_table(model, settings) if every or not often else often
+    width = min(shutil.get_terminal_size((WIDTH, 24)).columns, WIDTH)
     purpose = inspect.cleandoc(model.__doc__ or "").splitlines()
     lines = [f"usage: {prog} [--NAME VALUE ...] [--config FILE]", ""]
     for paragraph in _paragraphs(purpose):
         lines += [*textwrap.wrap(paragraph, width), ""]
-    lines.append("Settings:" if len(shown) == len(settings) else "Settings that people change:")
-    for path, setting in shown.items():
-        lines += _entry(f"--{path.replace('_', '-')}", _details(setting), width)
-    lines += ["", "Also:"]
+    for title, paths in groups.items():
+        lines += textwrap.wrap(f"{title}:", width)
+        for path in paths:
+            lines += _entry(f"--{path.replace('_', '-')}", _details(settings[path]), width)
+        lines.append("")
+    lines.append("Also:")
     lines += _entry("--config FILE", "TOML file of settings", width)
-    if len(shown) < len(settings):
+    lines += _entry(
+        "--print-config", "print the settings that differ from the defaults, as such a file", width
+    )
+    if sum(map(len, groups.values())) < len(settings):
         lines += _entry("--help-all", f"all {len(settings)} settings", width)
     recipe = "which beats the recipe, " if "recipe" in settings else ""
     lines += [
@@ -132,6 +139,21 @@ def format_help(
         ),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _by_table(model: type[BaseModel], settings: Mapping[str, Setting]) -> dict[str, list[str]]:
+    """Return the settings' paths in groups: those of the program, then those of each table, titled with its purpose."""
+    groups: dict[str, list[str]] = {}
+    for path in sorted(settings, key=lambda path: "." in path):
+        title, owner = "Settings", model
+        *tables, _ = path.split(".")
+        for table in tables:
+            owner = owner.model_fields[table].annotation  # type: ignore[assignment]  # settings_of found a model there
+        if tables:
+            purpose = inspect.cleandoc(owner.__doc__ or "").partition("\n")[0].rstrip(".")
+            title = f"[{'.'.join(tables)}] {purpose}".rstrip()
+        groups.setdefault(title, []).append(path)
+    return groups
 
 
 def _paragraphs(lines: Sequence[str]) -> list[str]:

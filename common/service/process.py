@@ -21,10 +21,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
-from common.comms.certificates import CertificateError
-from common.comms.keys import KeyPartError
-from common.errors import ReportedError
-from common.service.config import ConfigError, HelpRequest
+from common.errors import ConfigError, HelpRequest, ReportedError
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +33,6 @@ INTERRUPTED: Final = 130
 # An error that a user can fix gets one line. Any other error is a bug and keeps its traceback.
 STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ConfigError: BAD_CONFIG,
-    KeyPartError: BAD_CONFIG,
-    CertificateError: BAD_CONFIG,
     ReportedError: FAILED,
 }
 

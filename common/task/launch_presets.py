@@ -4,13 +4,14 @@ import math
 from collections.abc import Mapping
 from enum import IntEnum
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from common.task.config import PresetName
+
 Array = npt.NDArray[np.float64]
-PresetName = Literal["paper", "strong", "mixed", "match", "elite", "serve", "all"]
 
 # Distribution of one quantity: its quantiles at LEVELS, with straight lines between them. Nothing beyond the ends is
 # drawn.

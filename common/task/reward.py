@@ -13,7 +13,6 @@ Every entry of R is a sum of a constant and four features:
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 
 from common.task.states import State
 
@@ -41,55 +40,6 @@ R: dict[State, tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]] =
 
 TERMS = ("catch_approach", "bounce", "contact", "aim", "landing", "torque", "jitter", "collision")
 """Names of the reward's terms, in the order of kernels and rollouts."""
-
-
-class RewardConfig(BaseModel):
-    """The reward's settings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    reference_rate_hz: float = Field(
-        50.0,
-        gt=0,
-        le=1000,
-        description="control rate at which the rewards of continuing states, torque and collision are not scaled",
-        json_schema_extra={"unit": "Hz"},
-    )
-    torque: float = Field(
-        0.02, ge=0, le=10, description="c: weight of sum |T_i|/T_max,i", json_schema_extra={"unit": "-"}
-    )
-    jitter: float = Field(
-        0.02, ge=0, le=10, description="d: weight of sum (a(t) - a(t-1))^2", json_schema_extra={"unit": "-"}
-    )
-    collision: float = Field(
-        10.0,
-        ge=0,
-        le=100,
-        description="e: weight of sum min(F_c/50 N, 1) over the links: contacts with table, floor, net, robot",
-        json_schema_extra={"unit": "-"},
-    )
-    landing_scale: float = Field(
-        0.5,
-        gt=0,
-        le=10,
-        description="length scale s of the landing reward; 1 m in the paper",
-        json_schema_extra={"unit": "m"},
-    )
-    landing_bonus: float = Field(
-        100.0,
-        ge=0,
-        le=1000,
-        description="weight w of stage 3's bonus right after the contact: w/(1 + (e/s)^2), e the distance from the "
-        "predicted landing point to the target; half of it if the ball will not clear the net; 0 in the paper",
-        json_schema_extra={"unit": "-"},
-    )
-    landing_bonus_scale: float = Field(
-        0.5, gt=0, le=10, description="length scale s of the landing bonus", json_schema_extra={"unit": "m"}
-    )
-
-
-PAPER_REWARD = RewardConfig(reference_rate_hz=200.0, collision=0.1, landing_scale=1.0, landing_bonus=0.0)
-"""The paper's reward at its 200 Hz: R as printed and e_r, without landing bonus. The default differs in all four."""
 
 
 def reward_table() -> npt.NDArray[np.float64]:

@@ -11,8 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from common.env.rally_env import FinishedRallies
+from common.task.config import PresetName
 from common.task.counter_rng import Stream, uniform
-from common.task.launch_presets import PRESETS, Kind, PresetName
+from common.task.launch_presets import PRESETS, Kind
 from common.task.randomization import RallyParameter
 from common.task.states import Outcome
 

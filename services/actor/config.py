@@ -4,14 +4,33 @@ from typing import ClassVar, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.service.settings import Fleet, ServiceConfig
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
-from services.actor.outbox import OutboxConfig
 
 ENVS: Final = 256  # environments that the actors of a run share
 FEWEST_ENVS: Final = 16  # of each actor
+
+
+class OutboxConfig(BaseModel):
+    """How an actor sends and retries."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    window: int = Field(2, ge=1, le=2, description="rollouts that may be in flight at once")
+    request_timeout_s: float = Field(
+        10.0, gt=0, description="wait for a verdict before the next try", json_schema_extra={"unit": "s"}
+    )
+    retry_first_s: float = Field(
+        0.1, gt=0, description="pause before the first retry; doubles", json_schema_extra={"unit": "s"}
+    )
+    retry_max_s: float = Field(
+        5.0, gt=0, description="longest pause between retries", json_schema_extra={"unit": "s"}
+    )
+    give_up_s: float = Field(
+        86_400.0, gt=0, description="age at which a rollout is dropped", json_schema_extra={"unit": "s"}
+    )
 
 
 class ActorOptions(BaseModel):
@@ -53,10 +72,10 @@ class ActorConfig(ServiceConfig, Fleet, ActorOptions):
     [task], [network] and [experience] must be the learner's, otherwise the actor refuses its policies.
     """
 
-    often: ClassVar = (
-        *("run", "endpoint", "id", "index", "actors", "envs"),
-        *("task.launch", "task.randomization", "seed", "metrics_port"),
-    )
+    often: ClassVar = {
+        "The run": ("run", "endpoint", "id", "index", "actors", "metrics_port"),
+        "Play": ("envs", "task.launch", "task.randomization", "seed"),
+    }
 
     index: int = Field(
         0,

@@ -11,30 +11,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from common.comms.budgets import LISTED_REFUSALS
 from common.comms.messages import FINAL_VERDICTS, ActorReport, Refusal, Verdict, VerdictKind
-
-
-class OutboxConfig(BaseModel):
-    """How an actor sends and retries."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    window: int = Field(2, ge=1, le=2, description="rollouts that may be in flight at once")
-    request_timeout_s: float = Field(
-        10.0, gt=0, description="wait for a verdict before the next try", json_schema_extra={"unit": "s"}
-    )
-    retry_first_s: float = Field(
-        0.1, gt=0, description="pause before the first retry; doubles", json_schema_extra={"unit": "s"}
-    )
-    retry_max_s: float = Field(
-        5.0, gt=0, description="longest pause between retries", json_schema_extra={"unit": "s"}
-    )
-    give_up_s: float = Field(
-        86_400.0, gt=0, description="age at which a rollout is dropped", json_schema_extra={"unit": "s"}
-    )
+from services.actor.config import OutboxConfig
 
 
 class OutboxFullError(RuntimeError):

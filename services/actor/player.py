@@ -12,7 +12,8 @@ from common.comms.messages import Episodes, PolicySnapshot, Rollout
 from common.env.hit_corrections import HitCorrections
 from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
 from common.env.teacher import Teacher, teacher_of
-from common.policy.actor_critic import NetworkConfig, log_prob
+from common.policy.actor_critic import log_prob
+from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError, training_hash
 from common.policy.network_pass import NetworkPass, native_precision
 from common.policy.normalizer import Moments, normalize

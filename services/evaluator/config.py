@@ -4,8 +4,8 @@ from typing import ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.evaluation.match import DEFAULT_ENVS, Environments
-from common.policy.actor_critic import NetworkConfig
+from common.evaluation.config import DEFAULT_ENVS, Environments
+from common.policy.config import NetworkConfig
 from common.service.settings import ServiceConfig
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
@@ -35,10 +35,11 @@ class EvaluatorConfig(ServiceConfig, EvaluatorOptions):
     To measure one policy, use `topspin evaluate`.
     """
 
-    often: ClassVar = (
-        *("run", "endpoint", "rallies", "interval_s", "envs", "niceness"),
-        *("task.launch", "task.randomization", "seed", "metrics_port"),
-    )
+    often: ClassVar = {
+        "The run": ("run", "endpoint", "metrics_port"),
+        "Evaluations": ("rallies", "interval_s", "envs", "niceness"),
+        "The task": ("task.launch", "task.randomization", "seed"),
+    }
 
     task: TaskConfig = TaskConfig()
     network: NetworkConfig = NetworkConfig()

@@ -92,7 +92,7 @@ class EvaluatorService:
         self._member.leave()
 
     def step(self) -> None:
-        """Request the policy when it is due, and evaluate it when it has arrived."""
+        """Request the policy when it is due, and evaluate it when it has arrived and is trained."""
         self._member.answer_control()
         now = self._clock()
         self._member.note_link(now)
@@ -104,7 +104,8 @@ class EvaluatorService:
             self._asked = None
             self._next_play = now + IDLE_WAIT_S
             snapshot = self._read(answer.payload) if isinstance(answer, Reply) else None
-            if snapshot and (snapshot.generation, snapshot.version) != self._played:
+            # Before its first update a run has no policy worth keeping, and actors and learner need the cores
+            if snapshot and snapshot.frames and (snapshot.generation, snapshot.version) != self._played:
                 self._played = (snapshot.generation, snapshot.version)
                 self._member.state = "playing"
                 self._evaluate(snapshot)

@@ -31,10 +31,10 @@ class GeneratorConfig(ServiceConfig, Fleet, GeneratorOptions):
     Launch preset, randomization and flight of [task] decide the rallies. They must be the same as the actors'.
     """
 
-    often: ClassVar = (
-        *("run", "endpoint", "index", "generators", "actors", "rate_hz"),
-        *("task.launch", "task.randomization", "seed", "metrics_port"),
-    )
+    often: ClassVar = {
+        "The run": ("run", "endpoint", "index", "generators", "actors", "metrics_port"),
+        "Rallies": ("rate_hz", "task.launch", "task.randomization", "seed"),
+    }
 
     index: int = Field(
         0, ge=0, exclude=True, description="number of this generator, from 0; decides its shards"

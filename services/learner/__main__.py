@@ -1,17 +1,16 @@
 """Run the learner: `python -m services.learner`."""
 
+# ruff: noqa: PLC0415 - what a service runs on is imported after its flags are read: --help answers at once
+
 import sys
 from collections.abc import Sequence
 from threading import Event
 
 from common.comms.keys import Keys
 from common.service.config import first_look, load
-from common.service.connection import connected
 from common.service.process import DONE, run_service
 from common.service.run_folder import RunFolder
-from services.learner import checkpoint
 from services.learner.config import LearnerConfig
-from services.learner.service import LearnerService
 
 PROG = "python -m services.learner"
 
@@ -20,6 +19,8 @@ def settings(argv: Sequence[str]) -> LearnerConfig:
     """Return the learner's settings; with --resume those of the run's config.toml, except for flags given now."""
     names = ("run", "folder", "resume", "auto_resume")
     asked = first_look(LearnerConfig, names, argv, prog=PROG, section="learner")
+    from services.learner import checkpoint
+
     folder = RunFolder.of(asked.run, asked.folder)
     is_resumed = asked.resume
     if asked.auto_resume and not is_resumed and checkpoint.checkpoints(folder.checkpoints):
@@ -35,6 +36,10 @@ def settings(argv: Sequence[str]) -> LearnerConfig:
 def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
     config = settings(sys.argv[1:])
+    from common.service.connection import connected
+    from services.learner import checkpoint
+    from services.learner.service import LearnerService
+
     Keys(config.run)  # refuses a name that can't be part of a key, before a folder is created
     folder = RunFolder.of(config.run, config.folder)
     if config.resume:

@@ -11,7 +11,8 @@ from common.comms.messages import AVERAGE, PolicySnapshot, StageChange, StageLog
 from common.comms.transport import Flow, Transport
 from common.policy.actor_critic import ActorCritic
 from common.policy.weights import pack
-from services.learner.training import EvaluatedWeights, Training
+from services.learner.config import EvaluatedWeights
+from services.learner.training import Training
 
 log = logging.getLogger(__name__)
 

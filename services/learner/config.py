@@ -1,19 +1,200 @@
 """Settings of the learner."""
 
+import math
 from typing import ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.service.settings import Fleet, ServiceConfig
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.learner.budget import BudgetConfig
-from services.learner.curriculum import CurriculumConfig
-from services.learner.divergence import DivergenceConfig
-from services.learner.intake import IntakeConfig
-from services.learner.ppo import PPOConfig
-from services.learner.training import EvaluatedWeights
+
+LAST_STAGE = 3
+EvaluatedWeights = Literal["mean", "newest"]
+
+
+class PPOConfig(BaseModel):
+    """Hyper-parameters of the update."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gamma: float = Field(0.99, gt=0, lt=1, description="discount per control step")
+    gae_lambda: float = Field(0.9, ge=0, le=1, description="trace decay of the advantage")
+    clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
+    mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
+    minibatch: int = Field(
+        2048, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
+    )
+    reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
+    value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
+    entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
+    bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
+    gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
+    schedule: Literal["adaptive", "constant_then_linear"] = Field(
+        "adaptive",
+        description="of the learning rate: adaptive: it follows the KL divergence of each pass; constant_then_linear: "
+        "learning_rate, and over the last stage linearly to learning_rate_min, as in the paper",
+    )
+    learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
+    learning_rate_min: float = Field(
+        2e-5, gt=0, le=0.1, description="lower bound of the adaptation; end of the linear decay"
+    )
+    learning_rate_max: float = Field(
+        1e-3, gt=0, le=0.1, description="upper bound of the adaptation; decays over the last stage"
+    )
+    target_kl: float = Field(
+        0.01, gt=0, le=1, description="KL(prox, new) that the adapted learning rate aims at"
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto",
+        description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
+        "CPU multiplies it natively",
+    )
+    correction_weight: float = Field(
+        500.0,
+        ge=0,
+        description="weight of the loss that pulls the mean towards hit corrections or a teacher; 0: PPO alone",
+    )
+    refit_epochs: int = Field(
+        24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
+    )
+    refit_variance: float = Field(
+        0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
+    )
+
+    @model_validator(mode="after")
+    def _bounds_are_in_order(self) -> Self:  # the starting rate is clipped to them when it adapts
+        if self.learning_rate_min > self.learning_rate_max:
+            raise ValueError(
+                f"learning_rate_min {self.learning_rate_min:g}; "
+                f"allowed: up to learning_rate_max, {self.learning_rate_max:g}"
+            )
+        if self.schedule == "constant_then_linear" and self.learning_rate_min > self.learning_rate:
+            raise ValueError(
+                f"learning_rate_min {self.learning_rate_min:g}; "
+                f"allowed: up to learning_rate, {self.learning_rate:g}, under schedule constant_then_linear"
+            )
+        return self
+
+
+class CurriculumConfig(BaseModel):
+    """Lengths of the stages, in epochs (one dataset and its updates) or in shares of the run's frames."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stage_1: int = Field(244, ge=0, description="epochs of stage 1, catching (2 M frames of 8,192 an epoch)")
+    stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (1 M frames)")
+    stage_3: int = Field(14282, ge=0, description="epochs of stage 3, aiming (117 M frames)")
+    stage_shares: tuple[float, ...] = Field(
+        (),
+        description="three shares of the frames of the run (--frames) for stages 1, 2 and 3, in place of their epochs; "
+        "empty: the epochs count",
+    )
+    first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
+    catch_gate: float = Field(
+        0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
+    )
+    aiming_log_std: float = Field(
+        -2.5,
+        ge=-5,
+        le=1,
+        description="log of the action noise is at most this as stage 3 begins: hit corrections need strokes "
+        "that the noise does not hide",
+    )
+    count_reset: Literal["absorbed", "raw"] = Field(
+        "absorbed",
+        description="what the policy notices of a stage change, where the observation normaliser's count is set to 1: "
+        "absorbed: nothing, the network's first weights follow the moments; raw: the moments jump under the same "
+        "weights, as in the paper",
+    )
+
+    @model_validator(mode="after")
+    def _shares_are_three(self) -> Self:
+        shares = self.stage_shares
+        usable = len(shares) == LAST_STAGE and min(shares) >= 0 and math.isclose(sum(shares), 1.0)
+        if shares and not usable:
+            raise ValueError(
+                f"stage_shares {','.join(f'{share:g}' for share in shares)}; "
+                "allowed: empty, or three numbers from 0 that sum to 1"
+            )
+        if shares and shares[-1] == 0:
+            raise ValueError("stage_shares with 0 for stage 3; allowed: above 0, since stage 3 is the last")
+        return self
+
+    def check_budget(self, frames: int) -> None:
+        """Raise ValueError if stages are shares of a number of frames that is not set."""
+        if self.stage_shares and not frames:
+            raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
+
+    @property
+    def epochs(self) -> int | None:
+        """Return the epochs of all stages from the first one; None: shares of the frames decide."""
+        if self.stage_shares:
+            return None
+        return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])
+
+
+class DivergenceConfig(BaseModel):
+    """When training counts as diverged."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    collapse: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="share of the stage's best rate below which training has diverged; 0: never",
+    )
+    least: float = Field(0.2, gt=0, le=1, description="best rate from which on a stage is checked")
+    patience: int = Field(
+        20, ge=1, le=10_000, description="epochs below that share before training counts as diverged"
+    )
+
+
+class IntakeConfig(BaseModel):
+    """How much data an update takes, and how old it may be."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
+    max_lag: int = Field(
+        2,
+        ge=0,
+        le=64,
+        description="versions that a rollout may be older than the learner's; 0 is strictly synchronous",
+    )
+    target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
+    queue_rollouts: int = Field(
+        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
+    )
+    window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
+    credit_patience_s: float = Field(
+        30.0,
+        gt=0,
+        description="time without a new rollout after which an actor's credits go to others",
+        json_schema_extra={"unit": "s"},
+    )
+
+    @model_validator(mode="after")
+    def _a_dataset_fits_into_the_queue(self) -> Self:
+        if self.dataset_rollouts > self.queue_rollouts:
+            raise ValueError(
+                f"dataset_rollouts {self.dataset_rollouts}; allowed: up to queue_rollouts, {self.queue_rollouts}"
+            )
+        return self
+
+    @property
+    def lag_aimed_at(self) -> int:
+        """Return how many datasets beyond the present one are collected ahead."""
+        return min(self.target_lag, self.max_lag)
+
+    def for_actors(self, actors: int) -> Self:
+        """Return the settings with the size of a dataset for so many actors, and a queue of at least two datasets."""
+        rollouts = self.dataset_rollouts or actors
+        queue = self.queue_rollouts if self.dataset_rollouts else max(self.queue_rollouts, 2 * rollouts)
+        return self.model_copy(update={"dataset_rollouts": rollouts, "queue_rollouts": queue})
 
 
 class LearnerOptions(BaseModel):
@@ -39,6 +220,11 @@ class LearnerOptions(BaseModel):
         description="time without a dataset after which the log says what is missing",
         json_schema_extra={"unit": "s"},
     )
+    writers: tuple[str, ...] = Field(
+        (),
+        description="more writers of the run's curves, besides TensorBoard's: entry points topspin.writers of "
+        "installed packages",
+    )
     history: str = Field(
         "", description="folder for a history: a line for each event of a rollout; empty: none"
     )
@@ -50,10 +236,11 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
     The learner is the run's hub: start it first. [task], [network] and [experience] must be those of its actors.
     """
 
-    often: ClassVar = (
-        *("run", "resume", "actors", "minutes", "frames", "endpoint"),
-        *("task.launch", "ppo.learning_rate", "curriculum.first_stage", "seed"),
-    )
+    often: ClassVar = {
+        "The run": ("run", "resume", "actors", "endpoint"),
+        "Its end": ("minutes", "frames"),
+        "Training": ("task.launch", "ppo.learning_rate", "curriculum.first_stage", "seed"),
+    }
 
     mode: Literal["hub", "client"] = Field(
         "hub", exclude=True, description="hub: listen at the endpoint; client: connect to a router there"

@@ -7,68 +7,8 @@ reward matrix R applies.
 
 import math
 from dataclasses import dataclass
-from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-
-LAST_STAGE = 3
-
-
-class CurriculumConfig(BaseModel):
-    """Lengths of the stages, in epochs (one dataset and its updates) or in shares of the run's frames."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    stage_1: int = Field(244, ge=0, description="epochs of stage 1, catching (2 M frames of 8,192 an epoch)")
-    stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (1 M frames)")
-    stage_3: int = Field(14282, ge=0, description="epochs of stage 3, aiming (117 M frames)")
-    stage_shares: tuple[float, ...] = Field(
-        (),
-        description="three shares of the frames of the run (--frames) for stages 1, 2 and 3, in place of their epochs; "
-        "empty: the epochs count",
-    )
-    first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
-    catch_gate: float = Field(
-        0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
-    )
-    aiming_log_std: float = Field(
-        -2.5,
-        ge=-5,
-        le=1,
-        description="log of the action noise is at most this as stage 3 begins: hit corrections need strokes "
-        "that the noise does not hide",
-    )
-    count_reset: Literal["absorbed", "raw"] = Field(
-        "absorbed",
-        description="what the policy notices of a stage change, where the observation normaliser's count is set to 1: "
-        "absorbed: nothing, the network's first weights follow the moments; raw: the moments jump under the same "
-        "weights, as in the paper",
-    )
-
-    @model_validator(mode="after")
-    def _shares_are_three(self) -> Self:
-        shares = self.stage_shares
-        usable = len(shares) == LAST_STAGE and min(shares) >= 0 and math.isclose(sum(shares), 1.0)
-        if shares and not usable:
-            raise ValueError(
-                f"stage_shares {','.join(f'{share:g}' for share in shares)}; "
-                "allowed: empty, or three numbers from 0 that sum to 1"
-            )
-        if shares and shares[-1] == 0:
-            raise ValueError("stage_shares with 0 for stage 3; allowed: above 0, since stage 3 is the last")
-        return self
-
-    def check_budget(self, frames: int) -> None:
-        """Raise ValueError if stages are shares of a number of frames that is not set."""
-        if self.stage_shares and not frames:
-            raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
-
-    @property
-    def epochs(self) -> int | None:
-        """Return the epochs of all stages from the first one; None: shares of the frames decide."""
-        if self.stage_shares:
-            return None
-        return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])
+from services.learner.config import LAST_STAGE, CurriculumConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,10 @@ from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.advantage import gae
+from services.learner.config import PPOConfig
 from services.learner.epoch_stats import PlayStats, merged, play_counts
 from services.learner.group import ALONE, Group
-from services.learner.ppo import Dataset, PPOConfig, Share, denormalized, explained_variance
+from services.learner.ppo import Dataset, Share, denormalized, explained_variance
 
 Floats = npt.NDArray[np.float32]
 

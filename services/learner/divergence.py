@@ -8,28 +8,12 @@ stage, or when updates are no longer finite. The learner then goes back to its l
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+
+from services.learner.config import DivergenceConfig
 
 NOT_FINITE = "parameters are not finite"
 RUNNING = 0.2  # weight of the newest dataset in the running measure
 GOOD_SHARE = 0.95  # of the stage's best rate: a checkpoint above it is good
-
-
-class DivergenceConfig(BaseModel):
-    """When training counts as diverged."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    collapse: float = Field(
-        0.5,
-        ge=0,
-        lt=1,
-        description="share of the stage's best rate below which training has diverged; 0: never",
-    )
-    least: float = Field(0.2, gt=0, le=1, description="best rate from which on a stage is checked")
-    patience: int = Field(
-        20, ge=1, le=10_000, description="epochs below that share before training counts as diverged"
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,14 +10,13 @@ grant is lost for good.
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Self
-
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing import Final
 
 from common.comms.budgets import one_line
 from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
 from services.learner.accounts import Accounts, Life
 from services.learner.admission import Case, Header, LearnerState, differs, judge
+from services.learner.config import IntakeConfig
 from services.learner.credits import Credits
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, Outcome
 
@@ -27,50 +26,6 @@ _UNRECORDED: Final = frozenset({VerdictKind.DUPLICATE, VerdictKind.BUSY})
 IDLE_REPORTS_HZ: Final = 16.0  # reports of all waiting actors together: 2 % of a core (benchmarks.idle)
 SOONEST_REPORT_S: Final = 0.25  # pause between reports of a small fleet
 LATEST_REPORT_S: Final = 64.0  # of one of more than 1,000 actors
-
-
-class IntakeConfig(BaseModel):
-    """How much data an update takes, and how old it may be."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    dataset_rollouts: int = Field(0, ge=0, description="rollouts of one dataset; 0: one of each actor")
-    max_lag: int = Field(
-        2,
-        ge=0,
-        le=64,
-        description="versions that a rollout may be older than the learner's; 0 is strictly synchronous",
-    )
-    target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
-    queue_rollouts: int = Field(
-        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
-    )
-    window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
-    credit_patience_s: float = Field(
-        30.0,
-        gt=0,
-        description="time without a new rollout after which an actor's credits go to others",
-        json_schema_extra={"unit": "s"},
-    )
-
-    @model_validator(mode="after")
-    def _a_dataset_fits_into_the_queue(self) -> Self:
-        if self.dataset_rollouts > self.queue_rollouts:
-            raise ValueError(
-                f"dataset_rollouts {self.dataset_rollouts}; allowed: up to queue_rollouts, {self.queue_rollouts}"
-            )
-        return self
-
-    @property
-    def lag_aimed_at(self) -> int:
-        """Return how many datasets beyond the present one are collected ahead."""
-        return min(self.target_lag, self.max_lag)
-
-    def for_actors(self, actors: int) -> Self:
-        """Return the settings with the size of a dataset for so many actors, and a queue of at least two datasets."""
-        rollouts = self.dataset_rollouts or actors
-        queue = self.queue_rollouts if self.dataset_rollouts else max(self.queue_rollouts, 2 * rollouts)
-        return self.model_copy(update={"dataset_rollouts": rollouts, "queue_rollouts": queue})
 
 
 @dataclass(frozen=True, slots=True)

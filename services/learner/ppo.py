@@ -14,90 +14,26 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from enum import Enum, auto
-from typing import Literal, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 from torch import Tensor
 
 from common.policy.actor_critic import entropy, kl_divergence, log_prob
 from common.policy.network_pass import NetworkPass, Precision, native_precision
 from common.policy.normalizer import Moments
+from services.learner.config import PPOConfig
 from services.learner.group import ALONE, Group
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
 
 
-class PPOConfig(BaseModel):
-    """Hyper-parameters of the update."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    gamma: float = Field(0.99, gt=0, lt=1, description="discount per control step")
-    gae_lambda: float = Field(0.9, ge=0, le=1, description="trace decay of the advantage")
-    clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
-    mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
-    minibatch: int = Field(
-        2048, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
-    )
-    reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
-    value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
-    entropy_weight: float = Field(0.0, ge=0, le=1, description="weight of the entropy bonus")
-    bound_weight: float = Field(0.001, ge=0, description="weight of the loss on mean actions beyond +-1")
-    gradient_norm: float = Field(1.0, gt=0, description="largest norm of the gradient")
-    schedule: Literal["adaptive", "constant_then_linear"] = Field(
-        "adaptive",
-        description="of the learning rate: adaptive: it follows the KL divergence of each pass; constant_then_linear: "
-        "learning_rate, and over the last stage linearly to learning_rate_min, as in the paper",
-    )
-    learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
-    learning_rate_min: float = Field(
-        2e-5, gt=0, le=0.1, description="lower bound of the adaptation; end of the linear decay"
-    )
-    learning_rate_max: float = Field(
-        1e-3, gt=0, le=0.1, description="upper bound of the adaptation; decays over the last stage"
-    )
-    target_kl: float = Field(
-        0.01, gt=0, le=1, description="KL(prox, new) that the adapted learning rate aims at"
-    )
-    precision: Literal["auto", "float32", "bfloat16"] = Field(
-        "auto",
-        description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
-        "CPU multiplies it natively",
-    )
-    correction_weight: float = Field(
-        500.0,
-        ge=0,
-        description="weight of the loss that pulls the mean towards hit corrections or a teacher; 0: PPO alone",
-    )
-    refit_epochs: int = Field(
-        24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
-    )
-    refit_variance: float = Field(
-        0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
-    )
-
-    @property
-    def products(self) -> Precision:
-        """Return the precision of matrix products on this machine."""
-        return native_precision() if self.precision == "auto" else self.precision
-
-    @model_validator(mode="after")
-    def _bounds_are_in_order(self) -> Self:  # the starting rate is clipped to them when it adapts
-        if self.learning_rate_min > self.learning_rate_max:
-            raise ValueError(
-                f"learning_rate_min {self.learning_rate_min:g}; "
-                f"allowed: up to learning_rate_max, {self.learning_rate_max:g}"
-            )
-        if self.schedule == "constant_then_linear" and self.learning_rate_min > self.learning_rate:
-            raise ValueError(
-                f"learning_rate_min {self.learning_rate_min:g}; "
-                f"allowed: up to learning_rate, {self.learning_rate:g}, under schedule constant_then_linear"
-            )
-        return self
+def precision_of(config: PPOConfig) -> Precision:
+    """Return the precision of the update's matrix products on this machine."""
+    return native_precision() if config.precision == "auto" else config.precision
 
 
 @dataclass(frozen=True, slots=True)

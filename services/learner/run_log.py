@@ -1,20 +1,17 @@
-"""A run's log: one row per epoch, in metrics.csv and as TensorBoard events."""
+"""A run's log: one row per epoch, in metrics.csv and as curves."""
 
 import logging
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from common.errors import ReportedError
 from common.service import table
-from common.service.table import Table
+from common.service.table import Table, whole_rows
 from common.task.reward import TERMS
 from common.task.states import Outcome
 from services.learner.epoch_stats import EpochStats
-
-if TYPE_CHECKING:
-    from tensorboard.summary.writer.event_file_writer import EventFileWriter
-
+from services.learner.scalars import ScalarWriter, TensorBoardWriter, evaluation_scalars, scalars
 
 log = logging.getLogger(__name__)
 
@@ -68,13 +65,19 @@ class RunLog:
     Args:
         metrics: The CSV file.
         tensorboard: Folder of the events.
+        evaluations: The evaluator's CSV file, whose rows become curves too.
+        writers: Of curves, besides TensorBoard's.
     """
 
-    def __init__(self, metrics: Path, tensorboard: Path) -> None:
+    def __init__(
+        self, metrics: Path, tensorboard: Path, evaluations: Path, writers: Sequence[ScalarWriter] = ()
+    ) -> None:
         self._path = metrics
         self._table: Table | None = None
-        self._tensorboard = tensorboard
-        self._events: EventFileWriter | None = None
+        self._tensorboard, self._evaluations = tensorboard, evaluations
+        self._writers = (TensorBoardWriter(tensorboard), *writers)
+        self._evaluations_size = 0  # [bytes] of what was read
+        self._evaluations_read = 0  # rows
 
     def append(self, values: dict[str, float]) -> None:
         """Write one epoch's row."""
@@ -83,14 +86,14 @@ class RunLog:
         self._table.append(
             {name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()}
         )
-        try:
-            self._write_events(values)
-        except OSError as error:
-            self._events = None  # its thread has ended: the next epoch begins another file
-            log.error("can't write folder=%s reason=%s", self._tensorboard, error.strerror)
+        self._write(int(values["frames"]), scalars(values))
+        for row in self._new_evaluations(int(values["frames"])):
+            self._write(int(float(row["frames"])), evaluation_scalars(row))
 
     def truncate(self, epoch: int, frames: int) -> None:
         """Drop rows after ``epoch``, and TensorBoard's events after ``frames``: what a resumed run trains again.
+
+        The evaluations so far count as written.
 
         Raises:
             RunLogError: The table has no column ``epoch``.
@@ -103,35 +106,36 @@ class RunLog:
             kept = [row for row in found.rows if not float(row["epoch"] or "nan") > epoch]
             table.set_aside(self._path, found.refused)
             table.rewrite(self._path, found.columns, kept)
+        self._evaluations_read = len(whole_rows(self._evaluations))
         files = sorted(self._tensorboard.glob("events.*"), reverse=True)
-        if files:  # imported late, as in `_write_events`
+        if files:  # imported late, as in `TensorBoardWriter`
             from services.learner.event_files import cut_after  # noqa: PLC0415
         for file in files:
             if not cut_after(file, frames):
                 break
 
     def close(self) -> None:
-        """Write TensorBoard's buffer."""
-        if self._events is not None:
+        """Write what the writers keep back."""
+        for writer in self._writers:
             with suppress(OSError):
-                self._events.close()
+                writer.close()
 
-    def _write_events(self, values: dict[str, float]) -> None:
-        # Imported late: it takes a second, and the first batch should not wait for it.
-        from tensorboard.compat.proto.event_pb2 import Event  # noqa: PLC0415
-        from tensorboard.compat.proto.summary_pb2 import Summary  # noqa: PLC0415
-        from tensorboard.summary.writer.event_file_writer import EventFileWriter  # noqa: PLC0415
+    def _write(self, frames: int, found: Mapping[str, float]) -> None:
+        for writer in self._writers:
+            try:
+                writer.write(frames, found)
+            except OSError as error:
+                log.error("can't write the curves folder=%s reason=%s", self._tensorboard, error.strerror)
 
-        if self._events is None:
-            self._events = EventFileWriter(str(self._tensorboard))
-        group: dict[str, Any] = {"reward": "reward", "outcome": "outcome"}
-        summary = Summary(
-            value=[
-                Summary.Value(
-                    tag=f"{group.get(name.split('_')[0], 'training')}/{name}", simple_value=float(value)
-                )
-                for name, value in values.items()
-                if name not in ("epoch", "frames")
-            ]
-        )
-        self._events.add_event(Event(step=int(values["frames"]), summary=summary))
+    def _new_evaluations(self, frames: int) -> list[dict[str, str]]:
+        """Return the evaluations since the last call, of policies with up to ``frames``.
+
+        A learner that was restarted may find one that was begun before, of a policy that is no more.
+        """
+        size = self._evaluations.stat().st_size if self._evaluations.is_file() else 0
+        if size == self._evaluations_size:
+            return []
+        self._evaluations_size = size
+        fresh = whole_rows(self._evaluations)[self._evaluations_read :]
+        self._evaluations_read += len(fresh)
+        return [row for row in fresh if row.get("frames") and float(row["frames"]) <= frames]

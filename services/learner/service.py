@@ -34,6 +34,7 @@ from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot, Ledger
 from services.learner.members import IDLE_WAIT_S, Members
 from services.learner.run_log import RunLog, row
+from services.learner.scalars import own_writers
 from services.learner.training import Training
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,10 @@ class LearnerService:
         if not config.resume:
             teacher_of(task, teacher)  # before a folder is made
         self._folder.create()
-        self._run_log = RunLog(self._folder.metrics, self._folder.tensorboard)
+        writers = own_writers(config.writers, config.run, self._folder.root)
+        self._run_log = RunLog(
+            self._folder.metrics, self._folder.tensorboard, self._folder.evaluations, writers
+        )
         self._intake_config = config.intake.for_actors(config.actors)
         self.training = Training(
             config.ppo,

@@ -3,29 +3,30 @@
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from common.comms.messages import Rollout
-from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.actor_critic import ActorCritic
+from common.policy.config import NetworkConfig
 from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import TeacherConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
-from services.learner.curriculum import CurriculumConfig, StageLengths, Trained, decayed
+from services.learner.config import CurriculumConfig, DivergenceConfig, EvaluatedWeights, PPOConfig
+from services.learner.curriculum import StageLengths, Trained, decayed
 from services.learner.dataset import Batch, Distillation, Model, read
-from services.learner.divergence import DivergenceConfig, Health, divergence, running_mean, watched
+from services.learner.divergence import Health, divergence, running_mean, watched
 from services.learner.epoch_stats import EpochStats, Progress
 from services.learner.group import ALONE, Group
-from services.learner.ppo import LearningRate, PPOConfig, UpdateMode, update
+from services.learner.ppo import LearningRate, UpdateMode, precision_of, update
 
 Floats = npt.NDArray[np.float32]
 
-EvaluatedWeights = Literal["mean", "newest"]
 AVERAGE_DATASETS: Final = 100  # most datasets that the weights' running mean covers: 0.8 M frames
 # [-] share of the training so far that it covers before that. A longer mean of young weights, which learn fast, plays
 # worse than they do.
@@ -78,7 +79,7 @@ class Training:
         self.teacher = teacher
         # The learners that train together: set before the first epoch. All are made with the same arguments.
         self.group: Group = ALONE
-        self.network_pass = NetworkPass(self.network, ppo.minibatch, ppo.products)
+        self.network_pass = NetworkPass(self.network, ppo.minibatch, precision_of(ppo))
         self.optimizer = torch.optim.Adam(
             self.network.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True
         )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from common.comms.transport import Transport, TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.service.metrics import Metrics
 from common.service.settings import new_incarnation
 from services.actor.config import ActorConfig
@@ -19,10 +19,7 @@ from services.evaluator.config import EvaluatorConfig
 from services.evaluator.service import EvaluatorService
 from services.generator.config import GeneratorConfig
 from services.generator.service import GeneratorService
-from services.learner.config import LearnerConfig
-from services.learner.curriculum import CurriculumConfig
-from services.learner.intake import IntakeConfig
-from services.learner.ppo import PPOConfig
+from services.learner.config import CurriculumConfig, IntakeConfig, LearnerConfig, PPOConfig
 from services.learner.service import LearnerService
 
 NETWORK = NetworkConfig(units=(32, 16))

@@ -12,12 +12,12 @@ from common.comms.messages import VerdictKind
 from common.comms.transport import TransportError
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.folder import load_policy, save_policy
 from common.task.config import TaskConfig
 from services.actor.rally_feed import NoRalliesError
 from services.learner.checkpoint import CheckpointError
-from services.learner.intake import IntakeConfig
+from services.learner.config import IntakeConfig
 from services.learner.service import RunExistsError
 from tests.integration.in_process_run import CURRICULUM, LONG, free_endpoint, local_run, progress
 from tests.waiting import wait_until

@@ -10,8 +10,7 @@ from common.comms.keys import Keys
 from common.comms.messages import ActorReport, PolicySnapshot, Verdict, VerdictKind
 from common.comms.transport import Flow, Reply
 from common.task.config import TaskConfig
-from services.learner.config import LearnerConfig
-from services.learner.intake import IntakeConfig
+from services.learner.config import IntakeConfig, LearnerConfig
 from services.learner.members import LearnerAliveError
 from services.learner.service import LearnerService
 from tests.integration.in_process_run import LONG, local_run, progress

@@ -9,7 +9,7 @@ import torch
 
 from common.policy.folder import load_policy
 from common.task.experience import ExperienceConfig
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig
 from tests.integration.in_process_run import CURRICULUM, PPO, local_run
 from tests.unit.env.teachers import write_teacher
 from tests.waiting import wait_until
@@ -24,7 +24,8 @@ def ledger(scraped):
 def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_path):
     with local_run(tmp_path) as s:
         learner = s.learner()  # the hub: it must listen before the others connect
-        generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
+        evaluator = s.evaluator()  # it asks for the policy before anything is trained
+        generator, actors = s.generator(), [s.actor(0), s.actor(1)]
         wait_until(lambda: learner.service.training.progress.stage == 3, 60, "stage 3")
         wait_until(
             lambda: all(actor.scrape()["topspin_stage"] == 3 for actor in actors),
@@ -54,6 +55,9 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
     assert (
         json.loads((tmp_path / "policy" / "best" / "contract.json").read_text())["measures"]["rallies"] == 20
     )
+    with (tmp_path / "report" / "evaluations.csv").open() as file:
+        assert min(int(row["frames"]) for row in csv.DictReader(file)) > 0  # never the untrained policy
+    assert load_policy(tmp_path / "policy" / "best").contract.frames > 0
     assert list((tmp_path / "tb").iterdir())
 
 

@@ -17,7 +17,7 @@ TINY = [
     *("--actor.envs", "32", "--actor.horizon", "16"),
     *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-epochs", "1"),
     *("--evaluator.rallies", "20", "--evaluator.envs", "10", "--evaluator.interval-s", "1"),
-    *("--final-rallies", "40", "--panel", "off"),
+    *("--final-rallies", "40", "--panel", "off", "--json"),
 ]
 STAGES = ["--learner.curriculum.stage-1", "3", "--learner.curriculum.stage-2", "2"]
 

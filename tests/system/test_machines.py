@@ -31,7 +31,7 @@ def test_a_run_on_a_file_system_without_links_is_copied_as_plain_files_and_goes_
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "runs", copy / "runs")
     shutil.copytree(copy / "runs" / "r", copy / "runs" / "latest")  # as a copy that followed the link
-    resumed = ["--run", "r", "--resume", "--learner.curriculum.stage-3", 2, "--evaluate", "false"]
+    resumed = ["--run", "r", "--resume", "--learner.curriculum.stage-3", 2, "--evaluate", "false", "--json"]
     status, out, err = run(copy, "deploy.local", *resumed, **how)
 
     assert status == 0, err

@@ -97,7 +97,7 @@ def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_inter
         status, out, err = command.wait(60)
     first, trained = last_json(out), rows(tmp_path)
 
-    resume = ("--run", "r", "--resume", "--frames", first["frames"] + 20 * 1024)
+    resume = ("--run", "r", "--resume", "--frames", first["frames"] + 20 * 1024, "--json")
     again, out, err_again = run(tmp_path, "deploy.local", *resume)
     second, retrained = last_json(out), rows(tmp_path)
 

@@ -1,35 +1,21 @@
 """`topspin export`: write a policy as a folder for a robot."""
 
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
 import json
-import logging
-import shutil
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from threading import Event
 from typing import ClassVar, Final
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.errors import ReportedError
-from common.evaluation.match import MatchSpin
-from common.policy.box import policy_folder
-from common.policy.contract import PolicyError
-from common.policy.folder import Policy, load_policy
+from common.evaluation.config import MatchSpin
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
-from topspin.export.wheel import PROJECT, build_wheel
-from topspin.robot.contract import CONTRACT_FILE, POLICY_FILE, RobotContract, sha256_of
-
-log = logging.getLogger(__name__)
 
 PROG: Final = "topspin export"
-EXAMPLE: Final = PROJECT / "examples" / "robot.py"
-CHECKED: Final = 1000  # observations on which the written network is compared with the policy's own
-TOLERANCE: Final = 1e-5  # largest difference of an action
 
 
 class ExportConfig(BaseModel):
@@ -41,7 +27,10 @@ class ExportConfig(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
-    often: ClassVar = ("policy", "out", "expected_spin", "json")
+    often: ClassVar = {
+        "The policy": ("policy", "expected_spin"),
+        "What is written": ("out", "json"),
+    }
 
     policy: str = Field(
         "default", description="a policy of the box, or a policy folder: runs/NAME/policy/latest"
@@ -55,6 +44,10 @@ def main(argv: Sequence[str], _stop: Event) -> int:
     """Export; return the exit status."""
     config = load(ExportConfig, argv, prog=PROG, section="export")
     set_up_logging("info", "export")
+    from common.policy.box import policy_folder
+    from common.policy.folder import load_policy
+    from topspin.export.folder import check_free, export_policy
+
     out = Path(config.out)
     check_free(out)
     source = policy_folder(config.policy)
@@ -78,90 +71,3 @@ def main(argv: Sequence[str], _stop: Event) -> int:
             f"next: pip install {out}/*.whl; python -m topspin_robot {out}\n"
         )
     return DONE
-
-
-def check_free(out: Path) -> None:
-    """Raise ReportedError unless ``out`` is new or an empty folder."""
-    if out.is_dir() and not any(out.iterdir()):
-        return
-    if out.exists() or out.is_symlink():
-        kind = "is not empty" if out.is_dir() else "is no folder"
-        raise ReportedError(f"{out} {kind}; allowed: a new or an empty folder (--out)")
-
-
-def export_policy(
-    policy: Policy, name: str, out: Path, expected_spin: MatchSpin = "contract"
-) -> tuple[RobotContract, float]:
-    """Write the folder of a policy; return its contract, and the largest difference of an action from the policy's.
-
-    Args:
-        policy: The policy.
-        name: What it is called.
-        out: New or empty. It is complete or untouched: all files are written beside it first.
-        expected_spin: What the observer expects of the balls' spin.
-
-    Raises:
-        ReportedError: The policy can't be used by a robot, a library is missing, or the folder can't be written.
-    """
-    if policy.contract.task.observation.spin == "true":
-        raise PolicyError(
-            f"policy {name!r} observes the true spin; allowed: a policy with spin estimated or hidden"
-        )
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise ReportedError(f"can't write beside {out}: {error.strerror}") from None
-    try:
-        result = _write(policy, name, fresh, expected_spin)
-        fresh.chmod(0o755)
-        if out.is_dir():
-            out.rmdir()
-        fresh.rename(out)
-    except OSError as error:
-        raise ReportedError(f"can't write {out}: {error.strerror}") from None
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-    return result
-
-
-def _write(policy: Policy, name: str, folder: Path, expected_spin: MatchSpin) -> tuple[RobotContract, float]:
-    try:  # an extra
-        import onnx  # noqa: PLC0415
-
-        from topspin.export.leapp import leapp_yaml  # noqa: PLC0415
-        from topspin.export.model_card import model_card  # noqa: PLC0415
-        from topspin.export.onnx_graph import add_metadata, policy_graph  # noqa: PLC0415
-        from topspin.export.robot_contract import robot_contract  # noqa: PLC0415
-    except ModuleNotFoundError as error:
-        raise ReportedError(f"an export needs {error.name}: pip install -e '.[export]'") from None
-    expecting = policy.contract.expecting(expected_spin)
-    outline = robot_contract(expecting, name, "")
-    model = policy_graph(policy, outline.of_joints("middle"), outline.of_joints("half_range"))
-    add_metadata(model, outline)
-    onnx.save_model(model, folder / POLICY_FILE)
-    contract = outline.model_copy(update={"policy_sha256": sha256_of(folder / POLICY_FILE)})
-    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
-    parity = parity_of(policy, folder / POLICY_FILE)
-    if not parity <= TOLERANCE:  # not-a-number too
-        raise ReportedError(f"the written network's actions differ by {parity:.1e}; allowed: {TOLERANCE:g}")
-    wheel = build_wheel(folder).name
-    example = EXAMPLE.read_text()
-    (folder / "example.py").write_text(example)
-    (folder / "leapp.yaml").write_text(leapp_yaml(contract, (folder / POLICY_FILE).read_bytes()))
-    (folder / "README.md").write_text(model_card(contract, example, wheel, parity))
-    return contract, parity
-
-
-def parity_of(policy: Policy, file: Path) -> float:
-    """Return the largest difference between actions of a written network and the policy's.
-
-    The observations are drawn as widely as those of the training.
-    """
-    from topspin.robot.network import Network  # noqa: PLC0415
-
-    width = policy.network.obs_size
-    moments, noise = policy.moments.first(width), np.random.default_rng(0).normal(size=(CHECKED, width))
-    obs = (moments.mean + np.sqrt(moments.var) * noise).astype(np.float32)
-    difference = Network(file, width).act(obs) - np.clip(policy.act(obs), -1.0, 1.0)
-    return float(np.abs(difference).max())

@@ -4,10 +4,10 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.evaluation.match import DEFAULT_ENVS, Environments, MatchSpin
+from common.evaluation.config import DEFAULT_ENVS, Environments, MatchSpin
 from common.service.settings import LogLevel
 from common.task.config import Perception, PlayConditions
-from topspin.render.options import FilmConfig
+from topspin.render.config import FilmConfig
 
 
 class Real2SimConfig(FilmConfig, PlayConditions):
@@ -18,10 +18,11 @@ class Real2SimConfig(FilmConfig, PlayConditions):
     first (valid_share); the rates are over these. Formats and frames: docs/real2sim.md.
     """
 
-    often: ClassVar = (
-        *("data", "policy", "mode", "perception", "randomization"),
-        *("expected_spin", "turn", "out", "seed", "json"),
-    )
+    often: ClassVar = {
+        "What plays": ("policy", "expected_spin", "perception"),
+        "The recordings": ("data", "mode", "turn", "randomization", "seed"),
+        "The result": ("out", "json"),
+    }
 
     data: str = Field("", description="recordings: a .json, .hdf5, .csv file, or a folder of them")
     policy: str = Field("default", description="a policy of the box, or a policy folder")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from common.physics.flight import Flight
+from common.physics.flight_model import Flight
 from common.task.launch import SPIN
 from topspin.real2sim import replay
 from topspin.real2sim.config import Real2SimConfig

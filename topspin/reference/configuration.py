@@ -7,8 +7,8 @@ from typing import Final
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from common.service.config import SHARED, TABLES, flag_of
 from common.service.config_help import Setting, settings_of
+from common.service.config_sources import SHARED, TABLES, flag_of
 from deploy.config import DeployConfig
 from deploy.router import RouterConfig
 from services.actor.config import ActorConfig

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 
 from common.evaluation.rally_recorder import RecordedRally
 from common.task.states import Outcome
+from topspin.render.config import FilmConfig
 from topspin.render.gl import Image, RenderError, wanted
 from topspin.render.overlay import OUTCOME_WORDS, Caption, Lettering
 from topspin.render.replay import BallPath, moment_at, path_of, position_at, spin_word
@@ -177,3 +178,22 @@ def _open_writer(ffmpeg: Any, path: Path, width: int, height: int, rate_hz: floa
     )
     writer.send(None)
     return writer
+
+
+def film(
+    path: Path,
+    rallies: Sequence[RecordedRally],
+    config: FilmConfig,
+    note: str,
+    on_tick: Callable[[], None],
+) -> None:
+    """Write the film of ``rallies`` with ``note`` in its pictures; ``on_tick`` is called between pictures."""
+    options = FilmOptions(config.width, config.height, config.rate_hz, config.slow, config.camera, note=note)
+    log.info("filming rallies=%d pictures=%d file=%s", len(rallies), picture_count(rallies, options), path)
+
+    def frames() -> Iterator[Image]:
+        for picture in pictures(rallies, options):
+            on_tick()
+            yield picture
+
+    write_film(path, frames(), config.width, config.height, config.rate_hz)

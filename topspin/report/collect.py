@@ -33,6 +33,11 @@ class TrainingCurve:
     seconds: Array  # (n,) since the first trained batch, through restarts
     stages: Array  # (n,)
 
+    @property
+    def reached(self) -> tuple[int, ...]:
+        """The stages that were trained, in order."""
+        return tuple(sorted({int(stage) for stage in self.stages if np.isfinite(stage)}))
+
     def stage_changes(self) -> list[tuple[int, float]]:
         """Return (stage, frames at which it began) of every stage after the first."""
         where = np.flatnonzero(np.diff(self.stages)) + 1

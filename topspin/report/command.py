@@ -1,5 +1,7 @@
 """The command line: `topspin report RUN... [--NAME VALUE ...]`."""
 
+# ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
+
 import json
 import logging
 import sys
@@ -9,15 +11,12 @@ from threading import Event
 from types import ModuleType
 from typing import Final
 
-from common.errors import ReportedError
-from common.evaluation.evaluate import check
-from common.service.config import ConfigError, load
+from common.errors import ConfigError, ReportedError
+from common.service.config import load
 from common.service.config_help import settings_of
 from common.service.log import set_up_logging
 from common.service.process import DONE
-from topspin.report.collect import find, read
 from topspin.report.config import ReportConfig
-from topspin.report.results import results
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +49,10 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Write a report, print its files, and return the exit status."""
     config = settings(argv)
     set_up_logging("info", "report")
+    from common.evaluation.evaluate import check
+    from topspin.report.collect import find, read
+    from topspin.report.results import results
+
     figures, page = _drawing()  # fails before hours of play, not after
     page.note(config.note)
     folders = list(
@@ -73,7 +76,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
 def _drawing() -> tuple[ModuleType, ModuleType]:
     """Return the modules for plots and page; raises ReportedError where their libraries aren't installed."""
     try:
-        from topspin.report import figures, page  # noqa: PLC0415 - an extra
+        from topspin.report import figures, page
     except ModuleNotFoundError as error:
         raise ReportedError(f"a report needs {error.name}: pip install -e '.[report]'") from None
     return figures, page

@@ -4,7 +4,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from common.evaluation.match import MatchConfig
+from common.evaluation.config import MatchConfig
 
 
 class ReportConfig(MatchConfig):
@@ -13,10 +13,11 @@ class ReportConfig(MatchConfig):
     The report is report.md, report.html (one file with its pictures) and results.json.
     """
 
-    often: ClassVar = (
-        *("runs", "out", "policy", "rallies", "launch", "rounds_too"),
-        *("note", "seed", "envs", "randomization"),
-    )
+    often: ClassVar = {
+        "The runs": ("runs", "policy"),
+        "The report": ("out", "note"),
+        "The rallies": ("rallies", "launch", "rounds_too", "seed", "envs", "randomization"),
+    }
 
     runs: tuple[str, ...] = Field(
         (), description="runs, by name under runs/ or by folder; RUN... means the same"

@@ -143,15 +143,20 @@ def _curve(ax: Axes, one: GroupResult, name: str, colour: str, by_time: bool) ->
         ax.plot([], [], color=colour, label=one.label)
         return
     if len(seeds) == 1:
-        ax.plot(*seeds[0], color=colour, linewidth=1.8, label=one.label)
+        ax.plot(*seeds[0], _style(seeds[0][0]), color=colour, linewidth=1.8, label=one.label)
         return
     for x, y in seeds:
-        ax.plot(x, y, color=colour, linewidth=0.7, alpha=0.45)
+        ax.plot(x, y, _style(x), color=colour, linewidth=0.7, alpha=0.45)
     start, end = max(x[0] for x, _ in seeds), min(x[-1] for x, _ in seeds)
     grid = np.linspace(start, max(start, end), 200)
     values = np.array([np.interp(grid, x, y) for x, y in seeds])
     ax.fill_between(grid, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, linewidth=0)
     ax.plot(grid, values.mean(axis=0), color=colour, linewidth=1.8, label=one.label)
+
+
+def _style(x: Array) -> str:
+    """Return how a curve is drawn: a line, or a point where it has only one, such as that of a first look."""
+    return "-" if len(x) > 1 else "o"
 
 
 def _stage_marks(

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from services.learner.config import LAST_STAGE
 from topspin.report.collect import Run
 
 BOOKKEEPING: Final = frozenset(
     {
         *("run", "recipe", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
-        *("silence_warning_s", "checkpoint_interval_s"),
+        *("silence_warning_s", "checkpoint_interval_s", "writers"),
         *("endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib"),
         *("tls", "metrics_host", "log_level", "status_interval_s"),
     }
@@ -18,7 +19,6 @@ BOOKKEEPING: Final = frozenset(
 """Settings that name, monitor or connect a run: they do not distinguish experiments."""
 
 EVALUATOR: Final = "evaluator"  # measures a run without changing it
-STAGES: Final = {1: "stages 1+2+3", 2: "stages 2+3", 3: "stage 3 only"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +52,22 @@ def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def description(settings: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Return the experiment's names: curriculum, teacher, contacts, observation, critic; each long and short.
+def stages_of(runs: Sequence[Run]) -> str:
+    """Return the stages that were trained, such as "stages 1+2"; without a record, those that the settings name."""
+    reached = sorted({stage for run in runs if run.training for stage in run.training.reached})
+    if not reached:
+        first = runs[0].settings.get("learner", {}).get("curriculum", {}).get("first_stage", 1)
+        reached = list(range(first, LAST_STAGE + 1))
+    return f"stages {'+'.join(map(str, reached))}" if len(reached) > 1 else f"stage {reached[0]} only"
+
+
+def description(settings: Mapping[str, Any], stages: str) -> tuple[tuple[str, str], ...]:
+    """Return the experiment's names: stages, teacher, contacts, observation, critic; each long and short.
 
     The short name of a default is empty.
     """
     task, experience = settings.get("task", {}), settings.get("experience", {})
     observation = task.get("observation", {})
-    first = settings.get("learner", {}).get("curriculum", {}).get("first_stage", 1)
-    stages = STAGES.get(first, f"from stage {first}")
     collision = f"{task.get('collision', 'tailored')} collisions"
     more = [f"history {observation['history']}"] if observation.get("history", 0) else []
     more += SPINS[observation.get("spin", "hidden")]
@@ -92,7 +99,7 @@ def group(runs: Sequence[Run]) -> tuple[Group, ...]:
     for run in runs:
         by_experiment.setdefault(repr(sorted(experiment(run.settings).items())), []).append(run)
     members = list(by_experiment.values())
-    parts = [description(of_one[0].settings) for of_one in members]
+    parts = [description(of_one[0].settings, stages_of(of_one)) for of_one in members]
     extras = _extras([experiment(of_one[0].settings) for of_one in members], parts)
     groups = []
     for of_one, part, extra in zip(members, parts, extras, strict=True):

@@ -9,8 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
-from common.service.config import flag_of
 from common.service.config_help import settings_of
+from common.service.config_sources import flag_of
 from deploy.config import DeployConfig
 from topspin.report.groups import leaves
 

@@ -11,7 +11,8 @@ from benchmarks.camera_filter import (
     quadratic_fit,
     summary,
 )
-from common.service.config import ConfigError, load
+from common.errors import ConfigError
+from common.service.config import load
 
 TIMES = np.array([[np.nan, 0.0, 0.1, 0.2], [np.nan, np.nan, np.nan, 0.2], [0.0, 0.05, 0.1, 0.2]])
 NOW = np.array([0.3, 0.3, 0.3])

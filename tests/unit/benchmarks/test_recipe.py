@@ -9,7 +9,7 @@ from benchmarks.recipe import RecipeConfig, known_settings, label, main, rungs, 
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
 from common.service.run_folder import RunFolder
-from deploy.prepare import settings
+from deploy.config import settings
 
 FINAL = {"return_rate": 0.5, "return_after_catch": 0.6, "target_error_mean": 0.4, "frames": 1000}
 

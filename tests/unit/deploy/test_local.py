@@ -10,8 +10,8 @@ from rich.console import Console
 
 from common.service.run_folder import RunFolder
 from deploy.config import DeployConfig
-from deploy.local import LEARNER, conclude, shows_panel
 from deploy.prepare import PreparedRun, RunFailedError, link_to_learner
+from deploy.run import LEARNER, conclude, shows_panel
 from deploy.supervisor import Spec, Supervisor
 
 

@@ -13,7 +13,8 @@ import kubernetes_validate
 import pytest
 import yaml
 
-from common.service.config import ConfigError, load
+from common.errors import ConfigError
+from common.service.config import load
 from deploy.manifests import compose, hosts, kubernetes
 from deploy.manifests.files import FOLDER, files
 from deploy.manifests.site import ROUTER, SITE

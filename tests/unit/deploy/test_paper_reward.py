@@ -13,8 +13,7 @@ from common.robot.chain_of import chain_of
 from common.task.launch import draw_rallies
 from common.task.randomization import PROFILES
 from common.task.states import State
-from deploy.config import RECIPES, DeployConfig
-from deploy.prepare import settings
+from deploy.config import RECIPES, DeployConfig, settings
 from tests.unit.env.rallies import Deck, hold
 from tests.unit.rally.scripted import AWAY, HOME, begin, make_launch, make_motion, make_rules
 

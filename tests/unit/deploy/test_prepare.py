@@ -9,18 +9,12 @@ from threading import Event
 import pytest
 
 from common.comms.certificates import CertificateError
-from common.service.config import ConfigError, load, read_toml
+from common.errors import ConfigError
+from common.service.config import load
+from common.service.config_sources import read_toml
 from common.service.run_folder import RunAliveError, RunFolder, newest_run
-from deploy.config import DeployConfig
-from deploy.prepare import (
-    PreparedRun,
-    RunFailedError,
-    link_to_learner,
-    metrics_ports,
-    new_name,
-    prepared,
-    settings,
-)
+from deploy.config import DeployConfig, settings
+from deploy.prepare import PreparedRun, RunFailedError, link_to_learner, metrics_ports, new_name, prepared
 from services.actor.config import ActorConfig
 from services.evaluator.config import EvaluatorConfig
 from services.generator.config import GeneratorConfig

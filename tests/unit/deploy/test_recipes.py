@@ -4,11 +4,12 @@ import tomllib
 
 import pytest
 
+from common.errors import ConfigError
 from common.policy.contract import contract_of
-from common.service.config import ConfigError, load, save_settings
+from common.service.config import load, save_settings
 from common.task.observation import critic_layout, policy_layout, size
-from deploy.config import RECIPES, DeployConfig
-from deploy.prepare import prepared, settings
+from deploy.config import RECIPES, DeployConfig, settings
+from deploy.prepare import prepared
 from services.actor.config import ActorConfig
 from services.learner.config import LearnerConfig
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import save_policy
 from common.policy.normalizer import Moments

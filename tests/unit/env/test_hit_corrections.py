@@ -37,7 +37,7 @@ from tests.unit.env.test_robot import HOME, make_strokes
 
 CHAIN = chain_of("rails")
 
-POLICY = Path(__file__).parents[3] / "assets" / "policies" / "default"
+POLICY = Path(__file__).parents[3] / "common" / "policies" / "default"
 
 
 def put_in_front_of_the_racket(env: RallyEnv, row: int, state: State) -> None:

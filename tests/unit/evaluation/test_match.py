@@ -3,10 +3,11 @@ import pytest
 
 from common.env.rally_env import RallyEnv
 from common.evaluation.breakdown import survival
-from common.evaluation.match import FixedRallies, MatchConfig, evaluation_rallies, match_task, play_match
+from common.evaluation.config import MatchConfig
+from common.evaluation.match import FixedRallies, evaluation_rallies, match_task, play_match
 from common.evaluation.unplayed_flight import unplayed_flight
-from common.physics.flight import Flight
-from common.policy.actor_critic import NetworkConfig
+from common.physics.flight_model import Flight
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import Policy
 from common.policy.normalizer import Moments

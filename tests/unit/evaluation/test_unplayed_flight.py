@@ -6,7 +6,7 @@ import pytest
 from common.env.rally_env import RallyEnv
 from common.evaluation.unplayed_flight import ARRIVAL_X, unplayed_flight
 from common.physics.constants import BALL_RADIUS, GRAVITY
-from common.physics.flight import Flight
+from common.physics.flight_model import Flight
 from common.physics.table_bounce import table_bounce
 from common.task.config import TaskConfig
 from common.task.launch import draw_rallies

@@ -2,7 +2,7 @@
 
 import pytest
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig

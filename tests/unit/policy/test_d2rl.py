@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.policy.actor_critic import ActorCritic, NetworkConfig, entropy, kl_divergence, log_prob
+from common.policy.actor_critic import ActorCritic, entropy, kl_divergence, log_prob
+from common.policy.config import NetworkConfig
 from common.policy.d2rl import D2RL
 from common.policy.normalizer import Moments, normalize
 from common.policy.weights import new_network

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.actor_critic import ActorCritic
+from common.policy.config import NetworkConfig
 from common.policy.network_pass import NetworkPass
 
 OBSERVED, PRIVILEGED, ACTIONS = 37, 17, 7

@@ -9,10 +9,17 @@ import pytest
 import torch
 from safetensors.numpy import load_file, save_file
 
-from common.policy.actor_critic import NetworkConfig
 from common.policy.box import names, policy_folder
-from common.policy.contract import PolicyError, contract_hash, contract_of, training_hash
-from common.policy.folder import CONTRACT_FILE, WEIGHTS_FILE, Policy, load_policy, mean_policy, save_policy
+from common.policy.config import NetworkConfig
+from common.policy.contract import (
+    CONTRACT_FILE,
+    WEIGHTS_FILE,
+    PolicyError,
+    contract_hash,
+    contract_of,
+    training_hash,
+)
+from common.policy.folder import Policy, load_policy, mean_policy, save_policy
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network, pack, unpack
 from common.task.config import TaskConfig
@@ -278,7 +285,7 @@ def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monk
     (tmp_path / "default").mkdir()
 
     assert names() == ["all", "default", "paper"]
-    assert policy_folder("default").resolve() == Path(__file__).parents[3] / "assets" / "policies" / "default"
+    assert policy_folder("default").resolve() == Path(__file__).parents[3] / "common" / "policies" / "default"
     assert load_policy(policy_folder("default")).contract.task.robot == "rails"
     assert policy_folder("./default").resolve() == tmp_path / "default"
     with pytest.raises(

@@ -13,9 +13,10 @@ from common.physics.flight import SIMPLE
 from common.rally.state import Rallies, RobotMotion, Rules, Step, allocate
 from common.rally.step import launch_rallies, play_step
 from common.robot.chain_of import chain_of
+from common.task.config import PAPER_REWARD, RewardConfig
 from common.task.launch_presets import Kind
 from common.task.randomization import PROFILES, RallyParameter, RandomizationProfile
-from common.task.reward import PAPER_REWARD, RewardConfig, reward_table
+from common.task.reward import reward_table
 from common.task.states import Outcome, State, transition_table
 
 Array = npt.NDArray[np.float64]

@@ -21,7 +21,7 @@ from tests.unit.env.rallies import PLAYED_OUT, Deck, random_actions
 
 CHAIN = chain_of("rails")
 
-POLICIES = Path(__file__).parents[3] / "assets" / "policies"
+POLICIES = Path(__file__).parents[3] / "common" / "policies"
 
 
 def ball_of(env: RallyEnv, launched: float) -> BallSample:

@@ -4,7 +4,9 @@ from typing import ClassVar, Literal
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.service.config import SHARED, TABLES, ConfigError, HelpRequest, load, save_settings, to_tables
+from common.errors import ConfigError, HelpRequest
+from common.service.config import load, save_settings, to_tables
+from common.service.config_sources import SHARED, TABLES
 
 
 class Frozen(BaseModel):
@@ -33,7 +35,7 @@ class LearnerOptions(Frozen):
 class Learner(Shared):
     """Settings of a learner."""
 
-    often: ClassVar = ("run", "max_lag", "ppo.clip")
+    often: ClassVar = {"The run": ("run",), "Learning": ("max_lag", "ppo.clip")}
 
     max_lag: int = Field(2, ge=0, description="versions behind", json_schema_extra={"unit": "versions"})
     learning_rate: float = Field(5e-4, gt=0)
@@ -167,7 +169,10 @@ def test_the_file_may_be_named_by_the_environment(toml):
         ("[learner.pppo]\nclip = 1", "unknown key learner.'pppo' in .*; did you mean 'ppo'?"),
         ("[lerner]\nmax_lag = 1", "unknown key 'lerner' in .*; did you mean 'learner'?"),
         ("rum = 'x'", "unknown key 'rum' in .*; did you mean 'run'?"),
-        ("max_lag = 1", "unknown key 'max_lag' in .*; "),
+        ("max_lag = 1", r"max_lag in .* stands in no table; allowed: under \[learner\]"),
+        ("clip = 0.1", r"clip in .* stands in no table; allowed: under \[learner.ppo\]"),
+        ("[ppo]\nclip = 0.1", r"unknown table \[ppo\] in .*; did you mean \[learner.ppo\]"),
+        ("[learner]\nclip = 0.1", "unknown key learner.'clip' in .*; did you mean 'learner.ppo.clip'"),
         ("[task]\nlunch = 'paper'", "unknown key task.'lunch' in .*; did you mean 'launch'?"),
         (
             "[learner.task]\nlaunch = 'paper'",
@@ -243,6 +248,27 @@ def test_the_long_help_has_unit_range_and_default_of_every_setting():
     assert "hub, client; default hub" in text
     assert "--task.launch which balls (paper, strong; default paper)" in text
     assert "TOPSPIN_LEARNER__PPO__CLIP" in text
+
+
+def test_help_is_grouped_by_purpose_and_the_long_one_by_table():
+    short, whole = help_of("--help").splitlines(), help_of("--help-all").splitlines()
+
+    assert short.index("The run:") < short.index("Learning:") < short.index("Also:")
+    assert whole.index("Settings:") < whole.index("[ppo]:") < whole.index("Also:")
+
+
+def test_what_differs_from_the_defaults_is_printed_as_a_file_that_says_the_same(toml):
+    given = ("--run", "night", "--ppo.clip", "0.1", "--task.launch", "strong", "--max-lag", "2")
+
+    text = help_of(*given, "--print-config")
+
+    assert tomllib.loads(text) == {
+        "run": "night",
+        "task": {"launch": "strong"},
+        "learner": {"ppo": {"clip": 0.1}},
+    }
+    assert load_learner(file=toml(text)) == load_learner(*given)
+    assert help_of("--print-config") == "# learner: every setting has its default\n"
 
 
 def test_the_task_is_set_once_for_every_program(toml):

@@ -10,8 +10,7 @@ import warnings
 import pytest
 
 from common.comms.transport import TransportError
-from common.errors import ReportedError
-from common.service.config import ConfigError, HelpRequest
+from common.errors import ConfigError, HelpRequest, ReportedError
 from common.service.log import set_up_logging
 from common.service.process import run_service
 

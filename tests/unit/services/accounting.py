@@ -6,7 +6,8 @@ from typing import Any
 from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.messages import Verdict, VerdictKind
 from services.learner.admission import Header, LearnerState
-from services.learner.intake import Intake, IntakeConfig
+from services.learner.config import IntakeConfig
+from services.learner.intake import Intake
 
 LEARNER_STATE = LearnerState(
     run="night", generation=1, version=10, stage_number=2, stage=3, training_hash="c0ffee"

@@ -11,9 +11,11 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from common.comms.messages import ActorReport, Verdict, VerdictKind
 from services.actor import outbox as ob
-from services.actor.outbox import Outbox, OutboxConfig
+from services.actor.config import OutboxConfig
+from services.actor.outbox import Outbox
 from services.learner.admission import Header, LearnerState
-from services.learner.intake import Intake, IntakeConfig, Queued
+from services.learner.config import IntakeConfig
+from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot, Ledger
 from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header
 

@@ -2,7 +2,8 @@
 
 import pytest
 
-from common.service.config import ConfigError, load
+from common.errors import ConfigError
+from common.service.config import load
 from services.generator.config import GeneratorConfig
 from services.learner.config import LearnerConfig
 

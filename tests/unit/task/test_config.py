@@ -4,10 +4,9 @@ import pytest
 from pydantic import ValidationError
 
 from common.physics.constants import GRID_STEP
-from common.physics.flight import Flight
-from common.task.config import MatchConditions, PlayConditions, TaskConfig
+from common.physics.flight_model import Flight
+from common.task.config import PAPER_REWARD, MatchConditions, PlayConditions, RewardConfig, TaskConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig
-from common.task.reward import PAPER_REWARD, RewardConfig
 
 MATCH = MatchConditions(
     randomization="hard",

@@ -6,8 +6,9 @@ import pytest
 from common.physics.chain import racket_pose
 from common.rally.step import play_step
 from common.robot.chain_of import chain_of
+from common.task.config import RewardConfig
 from common.task.randomization import PROFILES
-from common.task.reward import FEATURES, TERMS, R, RewardConfig, reward_table
+from common.task.reward import FEATURES, TERMS, R, reward_table
 from common.task.states import Outcome, State
 from tests.unit.rally.scripted import AWAY, HOME, begin, make_launch, make_motion, make_rules, play_ball
 

@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from common.physics.constants import RUBBERS
-from common.policy.actor_critic import NetworkConfig
 from common.policy.box import policy_folder
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_hash
 from common.policy.folder import load_policy
 from common.task.config import RubberName, TaskConfig

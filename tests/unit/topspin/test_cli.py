@@ -1,11 +1,13 @@
 """The `topspin` command: its subcommands, their help, and its mistakes."""
 
+import subprocess
+import sys
 from threading import Event
 
 import pytest
 
+from common.errors import ConfigError, HelpRequest
 from common.robot.chain_of import chain_of
-from common.service.config import ConfigError, HelpRequest
 from topspin.__main__ import COMMANDS, dispatch
 
 CHAIN = chain_of("rails")
@@ -32,7 +34,7 @@ def test_every_command_has_a_short_and_a_long_help(name):
     short, whole = help_of(name, "--help"), help_of(name, "--help-all")
 
     assert short.startswith(f"usage: topspin {name}")
-    assert sum(line.startswith("  --") for line in short.splitlines()) <= 12
+    assert sum(line.startswith("  --") for line in short.splitlines()) <= 14
     assert len(whole) > len(short) or "--help-all" not in short
     assert max(map(len, whole.splitlines())) <= 80
 
@@ -66,8 +68,9 @@ def test_importing_topspin_registers_the_environments_and_offers_policies():
         topspin.nothing  # noqa: B018
 
 
-def test_gymnasium_finds_the_environments_without_an_import():
-    from importlib.metadata import entry_points
+def test_gymnasium_imports_topspin_for_an_id_with_its_name():
+    code = "import gymnasium; print(gymnasium.make('topspin:topspin/Rally-v0').spec.id)"
 
-    (plugin,) = (point for point in entry_points(group="gymnasium.envs") if point.dist.name == "topspin")
-    assert plugin.load().__name__ == "register_envs"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert done.stdout == "topspin/Rally-v0\n"

@@ -3,9 +3,10 @@ from threading import Event
 
 import pytest
 
+from common.errors import ConfigError
 from common.evaluation.evaluate import StoppedError
 from common.policy.folder import save_policy
-from common.service.config import ConfigError, load
+from common.service.config import load
 from tests.unit.evaluation.test_match import make_policy
 from topspin import evaluate, play
 from topspin.pictures import PicturesConfig

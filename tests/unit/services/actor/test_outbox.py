@@ -2,7 +2,8 @@ import pytest
 
 from common.comms.messages import FINAL_VERDICTS, Refusal, VerdictKind
 from services.actor import outbox as ob
-from services.actor.outbox import Outbox, OutboxConfig, OutboxFullError
+from services.actor.config import OutboxConfig
+from services.actor.outbox import Outbox, OutboxFullError
 from tests.unit.services.accounting import make_verdict
 
 FAR = 2**62

@@ -8,7 +8,7 @@ import torch
 from common.comms.messages import PolicySnapshot
 from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections
 from common.env.rally_env import Launches
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError, contract_hash
 from common.policy.folder import load_policy
 from common.policy.network_pass import native_precision

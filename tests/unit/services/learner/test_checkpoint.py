@@ -8,11 +8,10 @@ import shutil
 import numpy as np
 import pytest
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from services.learner import checkpoint
 from services.learner.checkpoint import CheckpointError, DamagedCheckpointError, Extras
-from services.learner.curriculum import CurriculumConfig
-from services.learner.ppo import PPOConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.training import Training
 
 EXTRAS = Extras("r", 5, [], [], 1.5, closed=(("a", 3),), queue=(b"one", b"another"))

@@ -6,17 +6,17 @@ import shutil
 import numpy as np
 import pytest
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, save_policy
-from common.service.config import read_toml, save_settings
+from common.service.config import save_settings
+from common.service.config_sources import read_toml
 from common.service.table import Table, whole_rows
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.learner import checkpoint
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.generation import next_generation
-from services.learner.ppo import PPOConfig
 from services.learner.run_log import RunLog
 from services.learner.training import Training
 from tests.crash_points import killed_at_each_call
@@ -125,7 +125,7 @@ def test_a_killed_resume_leaves_curve_settings_and_generation_whole(tmp_path, fo
     first = next_generation(template / ".generation", 0)
 
     def resume():
-        RunLog(folder / "metrics.csv", folder / "tb").truncate(30, 0)
+        RunLog(folder / "metrics.csv", folder / "tb", folder / "e.csv").truncate(30, 0)
         save_settings(folder / "config.toml", {"run": "new"})
         next_generation(folder / ".generation", 0)
 

@@ -3,7 +3,8 @@ import math
 import pytest
 from pydantic import ValidationError
 
-from services.learner.curriculum import CurriculumConfig, StageLengths, Trained
+from services.learner.config import CurriculumConfig
+from services.learner.curriculum import StageLengths, Trained
 
 CONFIG = CurriculumConfig(stage_1=3, stage_2=2, stage_3=10)
 SHARES = CurriculumConfig(stage_shares=(0.14, 0.48, 0.38))

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from common.policy.actor_critic import NetworkConfig
-from services.learner.curriculum import CurriculumConfig
-from services.learner.ppo import PPOConfig
+from common.policy.config import NetworkConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout
 

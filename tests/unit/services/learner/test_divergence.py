@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.normalizer import normalize
 from services.learner import checkpoint
 from services.learner.checkpoint import Extras, keep, restore, save
-from services.learner.curriculum import CurriculumConfig
-from services.learner.divergence import DivergenceConfig, Health, divergence, watched
+from services.learner.config import CurriculumConfig, DivergenceConfig, PPOConfig
+from services.learner.divergence import Health, divergence, watched
 from services.learner.epoch_stats import Progress
-from services.learner.ppo import PPOConfig
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout
 

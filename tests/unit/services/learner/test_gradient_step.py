@@ -8,9 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from common.policy.actor_critic import ActorCritic, NetworkConfig
+from common.policy.actor_critic import ActorCritic
+from common.policy.config import NetworkConfig
 from common.policy.weights import new_network
-from services.learner.ppo import Dataset, LearningRate, PPOConfig, UpdateMode, minibatches, whole
+from services.learner.config import PPOConfig
+from services.learner.ppo import Dataset, LearningRate, UpdateMode, minibatches, whole
 from tests.unit.services.learner.test_ppo import make_data, update
 
 RATE = 1e-3

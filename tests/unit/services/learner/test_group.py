@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.weights import new_network
 from deploy.prepare import free_port
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.group import ALONE, Group, GroupError, join
-from services.learner.ppo import PPOConfig, Share, minibatches
+from services.learner.ppo import Share, minibatches
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout
 from tests.unit.services.learner.test_ppo import make_data

@@ -7,11 +7,13 @@ import pytest
 from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.codec import encode
 from common.comms.messages import ActorReport, VerdictKind
-from services.actor.outbox import Flight, Outbox, OutboxConfig, report
+from services.actor.config import OutboxConfig
+from services.actor.outbox import Flight, Outbox, report
 from services.learner import accounts as accounts_module
 from services.learner.accounts import BEYOND_CREDITS, EARLIER, FOLD_AFTER_S
 from services.learner.admission import RULES, open_rollout
-from services.learner.intake import IDLE_REPORTS_HZ, SOONEST_REPORT_S, Intake, IntakeConfig
+from services.learner.config import IntakeConfig
+from services.learner.intake import IDLE_REPORTS_HZ, SOONEST_REPORT_S, Intake
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake

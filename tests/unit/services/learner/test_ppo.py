@@ -4,26 +4,33 @@ import numpy as np
 import pytest
 import torch
 
-from common.policy.actor_critic import NetworkConfig, log_prob
+from common.policy.actor_critic import log_prob
+from common.policy.config import NetworkConfig
 from common.policy.network_pass import NetworkPass
 from common.policy.weights import new_network
+from services.learner.config import PPOConfig
 from services.learner.ppo import (
     Dataset,
     LearningRate,
-    PPOConfig,
     UpdateMode,
     adapted_learning_rate,
     bound_loss,
     correction_loss,
     explained_variance,
     policy_loss,
+    precision_of,
 )
 from services.learner.ppo import update as update_by
 
 
 def update(network, optimizer, data, config, *arguments, **named):
     return update_by(
-        NetworkPass(network, config.minibatch, config.products), optimizer, data, config, *arguments, **named
+        NetworkPass(network, config.minibatch, precision_of(config)),
+        optimizer,
+        data,
+        config,
+        *arguments,
+        **named,
     )
 
 

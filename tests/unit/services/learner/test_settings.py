@@ -1,11 +1,10 @@
 import pytest
 
-from common.service.config import ConfigError, save_settings, to_tables
+from common.errors import ConfigError
+from common.service.config import save_settings, to_tables
 from common.service.run_folder import RunFolder
 from services.learner.__main__ import settings
-from services.learner.config import LearnerConfig
-from services.learner.intake import IntakeConfig
-from services.learner.ppo import PPOConfig
+from services.learner.config import IntakeConfig, LearnerConfig, PPOConfig
 
 
 @pytest.fixture(autouse=True)

@@ -8,13 +8,12 @@ import pytest
 import torch
 
 from common.comms.messages import Episodes
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
-from services.learner.curriculum import CurriculumConfig
+from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.epoch_stats import play_stats
-from services.learner.ppo import PPOConfig
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout
@@ -269,7 +268,7 @@ def test_unvalidated_balls_are_in_no_rate():
 
 def test_an_epoch_without_ended_rallies_has_nan_rates_in_the_log(tmp_path):
     """No rally ended, or no validated one."""
-    training, record = make_training(), RunLog(tmp_path / "metrics.csv", tmp_path / "tb")
+    training, record = make_training(), RunLog(tmp_path / "metrics.csv", tmp_path / "tb", tmp_path / "e.csv")
     ended = make_rollout(0).episodes
     for epoch, episodes in enumerate(
         (

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import Policy
 from common.policy.normalizer import Moments
@@ -12,7 +12,7 @@ from common.policy.weights import new_network
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import PAPER_OBSERVATION, policy_layout, size
-from topspin.export.command import export_policy
+from topspin.export.folder import export_policy
 
 ROOT = Path(__file__).parents[4]
 

@@ -208,4 +208,4 @@ def test_the_readme_prints_the_example_that_is_tested():
         if "topspin_robot" in block
     ]
 
-    assert snippet == Path(ROOT / "examples" / "robot.py").read_text()
+    assert snippet == Path(ROOT / "topspin" / "export" / "example.py").read_text()

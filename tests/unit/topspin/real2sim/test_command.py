@@ -7,11 +7,11 @@ from threading import Event
 import numpy as np
 import pytest
 
-from common.errors import ReportedError
+from common.errors import ConfigError, ReportedError
 from common.evaluation.evaluate import StoppedError
-from common.physics.flight import Flight
+from common.physics.flight_model import Flight
 from common.policy.folder import save_policy
-from common.service.config import ConfigError, load
+from common.service.config import load
 from common.service.process import DONE
 from common.task.config import TaskConfig
 from common.task.launch import DRAG_FACTOR, KIND, draw_rallies
@@ -24,6 +24,7 @@ from topspin.real2sim.config import Real2SimConfig
 from topspin.real2sim.dataset import NO_TRACK, SAME_NAME, TOO_SHORT, TRACK_AWAY, evenly, read
 from topspin.real2sim.formats.deepmind import COLUMNS
 from topspin.real2sim.formats.tracks import RecordingError
+from topspin.real2sim.play import video_of
 from topspin.real2sim.replay import seed_of
 
 
@@ -262,10 +263,10 @@ def test_a_bad_setting_is_one_line_that_says_what_is_allowed(flags, line):
 
 
 def test_a_film_is_made_on_request():
-    assert command.video_of(settings()) is None
-    assert str(command.video_of(settings(out="o"))) == "o/rallies.mp4"
-    assert str(command.video_of(settings(out="o", video="v.mp4"))) == "v.mp4"
-    assert command.video_of(settings(out="o", film_rallies=0)) is None
+    assert video_of(settings()) is None
+    assert str(video_of(settings(out="o"))) == "o/rallies.mp4"
+    assert str(video_of(settings(out="o", video="v.mp4"))) == "v.mp4"
+    assert video_of(settings(out="o", film_rallies=0)) is None
 
 
 def test_without_its_libraries_a_report_names_the_extra(policy, tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import pytest
 
 from common.comms.messages import MESSAGES
-from common.service.config import TABLES
+from common.service.config_sources import TABLES
 from common.task.states import Outcome, State
 from topspin.reference.files import FOLDER, files
 

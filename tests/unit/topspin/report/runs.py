@@ -1,7 +1,7 @@
 """Runs, policies and results for the tests of reports."""
 
 from common.evaluation.measures import measures
-from common.policy.actor_critic import NetworkConfig
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import Policy
 from common.policy.normalizer import Moments

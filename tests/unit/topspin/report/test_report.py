@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -10,13 +11,13 @@ import numpy as np
 import pytest
 import tomli_w
 
-from common.errors import ReportedError
-from common.policy.actor_critic import NetworkConfig
+from common.errors import ConfigError, HelpRequest, ReportedError
+from common.policy.config import NetworkConfig
 from common.policy.contract import contract_of
 from common.policy.folder import load_policy, mean_policy, save_policy
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
-from common.service.config import ConfigError, HelpRequest, load, to_tables
+from common.service.config import load, to_tables
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import critic_layout, size
@@ -24,9 +25,10 @@ from deploy.config import DeployConfig
 from tests.unit.topspin.report.runs import make_run
 from topspin import report
 from topspin.report import command
-from topspin.report.collect import RunError, TrainingCurve, read
+from topspin.report.collect import CURVES, Curve, RunError, TrainingCurve, read
 from topspin.report.command import settings
 from topspin.report.config import ReportConfig
+from topspin.report.figures import curves
 from topspin.report.groups import experiment, group
 from topspin.report.provenance import command as command_of
 from topspin.report.provenance import run_defaults
@@ -145,7 +147,7 @@ def test_groups_are_named_by_their_differences():
             make_run("g", task=observing(**usual)),
             make_run("h", task=observing(ball="filtered")),
             make_run("i", task=observing(ball="filtered", **usual)),
-            make_run("j", task=observing(), experience={"teacher": {"policy": "assets/policies/default"}}),
+            make_run("j", task=observing(), experience={"teacher": {"policy": "common/policies/default"}}),
         ]
     )
 
@@ -274,7 +276,7 @@ def test_a_mean_of_policies_is_reported_as_one(tmp_path, monkeypatch):
     command.main(["a", "--rallies", "24", "--envs", "24", "--out", "o"], Event())
 
     page = (tmp_path / "o" / "report.md").read_text()
-    assert "| **Topspin, stages 1+2+3 (1 seed, mean of 2 policies)** |" in page
+    assert "| **Topspin, stages 1+2 (1 seed, mean of 2 policies)** |" in page
     assert "mean of 2, to 0.0 M, stage 2" in page
     assert "its policy is the mean of 2\n#     a 3000 frames, launch paper\n#     a 3000 frames" in page
     found = json.loads((tmp_path / "o" / "results.json").read_text())
@@ -301,7 +303,7 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     assert one["runs"][0]["stage_changes"] == [[2, 2000.0]]
     assert found["missing"] == ["b: no epochs in metrics.csv: frames, hours and stages are unknown"]
     page = (tmp_path / "o" / "report.md").read_text()
-    assert "| **Topspin, stages 1+2+3 (2 seeds)** | no |" in page
+    assert "| **Topspin, stages 1+2 (2 seeds)** | no |" in page
     assert "- b: no epochs in metrics.csv" in page
     assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
     assert "--rounds-too --note note.txt" in page
@@ -323,3 +325,32 @@ def test_an_unreadable_note_is_an_error_before_anything_is_played(tmp_path, monk
     with pytest.raises(ReportedError, match=r"can't read the note no\.txt: No such file"):
         command.main(["a", "--note", "no.txt"], Event())
     assert not (tmp_path / "runs" / "report").exists()
+
+
+def test_a_group_is_named_after_the_stages_that_were_trained():
+    def trained(*stages, seed=0):
+        frames = np.arange(len(stages), dtype=float)
+        return replace(make_run(seed=seed), training=TrainingCurve(frames, frames, np.array(stages, float)))
+
+    def name(*runs):
+        (one,) = group(runs)
+        return one.label
+
+    assert name(trained(1, 1)) == "stage 1 only"
+    assert name(trained(1, 1, 2)) == "stages 1+2"
+    assert name(trained(1, 2, 3)) == name(make_run()) == "stages 1+2+3"
+    assert name(trained(1), trained(1, 2, seed=1)) == "stages 1+2"  # each was reached by one of them
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_curve_of_one_point_is_drawn_as_a_point(seeds):
+    curve = Curve(np.array([1e6]), np.array([2.0]), {name: np.array([0.5]) for name in CURVES})
+    runs = tuple(
+        RunResult(replace(make_run(), curve=curve), 0, "", None, None, None, None, {}) for _ in range(seeds)
+    )
+    one = GroupResult("one", "one", runs, None, {}, {}, {}, {})
+
+    axes = curves([one], {one.label: "black"}, by_time=False).axes[1]
+
+    drawn = [line for line in axes.lines if len(line.get_xdata()) == 1]
+    assert [line.get_marker() for line in drawn] == ["o"] * seeds

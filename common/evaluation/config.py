@@ -1,0 +1,35 @@
+"""Settings of every command that plays a match."""
+
+from typing import Annotated, Final, Literal
+
+from pydantic import Field
+
+from common.task.config import MatchConditions
+from common.task.observation import ExpectedSpin
+
+DEFAULT_ENVS: Final = 250
+
+Environments = Annotated[
+    int,
+    Field(
+        ge=1,
+        le=65536,
+        description="environments played together; each plays rallies / envs balls of the same opponent",
+    ),
+]
+MatchSpin = Annotated[
+    ExpectedSpin | Literal["contract"],
+    Field(
+        description="spin that the robot expects (task.observation.expected_spin): mild, mixed, strong or learnt; "
+        "contract: as the policy's contract says"
+    ),
+]
+
+
+class MatchConfig(MatchConditions):
+    """A match: fixed rallies, and the conditions of play."""
+
+    rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to play")
+    seed: int = Field(20260, ge=0, lt=2**63, description="seed of the rallies")
+    envs: Environments = DEFAULT_ENVS
+    expected_spin: MatchSpin = "contract"
