@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 LOCK := $(BIN)/uv pip compile pyproject.toml requirements/beside.in --override requirements/without-torch.txt --upgrade \
 	--no-emit-package torch --universal --python-version 3.11 --generate-hashes --no-header --quiet
 # of the tests: the cores that this process may use, at most four

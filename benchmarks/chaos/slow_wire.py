@@ -1,4 +1,4 @@
-"""A TCP connection that can be made slow: bytes pass through this process on their way to the hub."""
+"""A TCP connection that can be made slow, or cut: bytes pass through this process on their way to the hub."""
 
 import asyncio
 import threading
@@ -20,10 +20,19 @@ class SlowWire:
 
     def __init__(self, port: int, host: str, hub_port: int) -> None:
         self.is_slow = False
+        self._writers: set[asyncio.StreamWriter] = set()
         self._port, self._target = port, (host, hub_port)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="wire", daemon=True)
         self._thread.start()
+
+    def cut(self) -> None:
+        """End what is connected; who connects again gets through."""
+        self._loop.call_soon_threadsafe(self._end_all)
+
+    def _end_all(self) -> None:
+        for writer in self._writers:
+            writer.transport.abort()
 
     def close(self) -> None:
         """End."""
@@ -44,7 +53,9 @@ class SlowWire:
         except OSError:
             writer.close()
             return
+        self._writers |= {writer, hub_writer}
         await asyncio.gather(self._pass(reader, hub_writer), self._pass(hub_reader, writer))
+        self._writers -= {writer, hub_writer}
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:

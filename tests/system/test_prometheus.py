@@ -3,19 +3,18 @@
 import json
 import resource
 import shutil
-import socket
 import subprocess
-import threading
 import time
 import urllib.error
 import urllib.parse
 import urllib.request
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 
 import psutil
 import pytest
 import yaml
 
+from benchmarks.chaos.slow_wire import SlowWire
 from common.comms.keys import Keys
 from common.comms.transport import Flow
 from common.comms.zenoh_config import ZenohConfig
@@ -154,62 +153,19 @@ def test_every_target_is_up_every_expression_has_data_and_an_alarm_stands_when_i
         wait_until(lambda: refused in api.firing(), 60, "its alarm")
 
 
-class Wire:
-    """A TCP connection to the hub that can be cut."""
-
-    def __init__(self, hub_port):
-        self.port, self._hub_port, self._ends = free_port(), hub_port, []
-        self._listening = socket.create_server(("127.0.0.1", self.port))
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def cut(self):
-        """Cut what is connected; a new connection is made at once."""
-        ends, self._ends = self._ends, []
-        for end in ends:
-            with suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def has_link(self):
-        """Return whether a connection stands for long enough that its service has noted it."""
-        return bool(self._ends) and time.monotonic() - self._since > 2.0
-
-    def close(self):
-        self.cut()
-        self._listening.close()
-
-    def _accept(self):
-        with suppress(OSError):  # closed
-            while True:
-                near, _ = self._listening.accept()
-                try:
-                    far = socket.create_connection(("127.0.0.1", self._hub_port))
-                except OSError:  # the hub is not there yet
-                    near.close()
-                    continue
-                self._ends, self._since = [*self._ends, near, far], time.monotonic()
-                for source, sink in ((near, far), (far, near)):
-                    threading.Thread(target=self._pass, args=(source, sink), daemon=True).start()
-
-    def _pass(self, source, sink):
-        with suppress(OSError):
-            while data := source.recv(65_536):
-                sink.sendall(data)
-        with suppress(OSError):
-            sink.shutdown(socket.SHUT_RDWR)
-
-
 def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
     port, metrics = free_port(), free_port()
     flags = ("--run", "r", "--actors", 2, "--endpoint", f"tcp/127.0.0.1:{port}", *TINY)
     sick = (
-        *("--learner.curriculum.stage-1", 100_000, "--learner.checkpoint-interval-s", 1),
+        *("--learner.curriculum.stage-1", 100_000, "--learner.checkpoint-interval-s", 2),
         *("--learner.intake.target-lag", 6, "--learner.intake.max-lag", 8),  # TopspinActorsLag
         *("--learner.divergence.collapse", 0.99, "--learner.divergence.patience", 1),  # TopspinDiverged
         *("--learner.divergence.least", 0.01, "--watchdog-s", 0),
     )
-    wire = Wire(port)
+    wire_port = free_port()
+    wire = SlowWire(wire_port, "127.0.0.1", port)
     misfit = (  # TopspinMisfitActors, and by its rare heartbeats TopspinServiceHangs
-        *("--run", "r", "--id", "odd", "--index", 7, "--endpoint", f"tcp/127.0.0.1:{wire.port}"),
+        *("--run", "r", "--id", "odd", "--index", 7, "--endpoint", f"tcp/127.0.0.1:{wire_port}"),
         *("--network.units", "16,16", "--envs", 16, "--status-interval-s", 15, "--metrics-port", metrics),
     )
     target = {"targets": [f"127.0.0.1:{metrics}"], "labels": {"run": "r", "role": "actor", "id": "odd"}}
@@ -241,7 +197,12 @@ def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
         (learner,) = children_of(tmp_path, "learner").values()
         (generator,) = children_of(tmp_path, "generator").values()
         wait_for("TopspinActorsLag", "TopspinMisfitActors", "TopspinServiceHangs", "TopspinDiverged")
-        wait_for("TopspinLinkUnstable", again=lambda: wire.has_link() and wire.cut())
+
+        def cut():
+            wire.cut()
+            time.sleep(2.0)  # the service notes that its link is back
+
+        wait_for("TopspinLinkUnstable", again=cut)
         handles = psutil.Process(odd.process.pid).num_fds()
         resource.prlimit(odd.process.pid, resource.RLIMIT_NOFILE, (handles + 4, handles + 4))
         wait_for("TopspinFilesRunOut")
@@ -271,12 +232,8 @@ def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
         wait_for("TopspinNoActors", "TopspinNotTraining", "TopspinNotSaved")
         for actor in (one, *others):
             actor.resume()
-
-        def kill_one():
-            next(iter(children_of(tmp_path, "actor").values())).kill()  # maybe with a rollout in flight
-            time.sleep(2.0)
-
-        wait_for("TopspinRolloutsLost", again=kill_one)
+        learner.kill()  # what it accepted after its last checkpoint is lost
+        wait_for("TopspinRolloutsLost")
 
     assert seen == {alarm.name for alarm in alarms.ALARMS}
 
