@@ -11,7 +11,7 @@ from common.task.launch import draw_rallies
 from tests.unit.evaluation.test_match import make_policy
 from tests.unit.topspin.real2sim.flights import launch_of, seen
 from tests.unit.topspin.real2sim.test_command import settings, write_csv, write_states
-from topspin.real2sim import command
+from topspin.real2sim import command, play
 from topspin.real2sim.dataset import read
 from topspin.real2sim.formats.recordings import load
 
@@ -89,8 +89,8 @@ def test_a_table_and_a_sidecar_name_players(tmp_path):
 
 
 def test_the_expected_spin_is_the_commands(tmp_path):
-    task = command.task_of(make_policy().contract, settings(expected_spin="strong"))
+    task = play.task_of(make_policy().contract, settings(expected_spin="strong"))
 
     assert task.observation.expected_spin == "strong"
     assert task.carry_over == 0.0
-    assert command.task_of(make_policy().contract, settings()).observation.expected_spin == "mild"
+    assert play.task_of(make_policy().contract, settings()).observation.expected_spin == "mild"
