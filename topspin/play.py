@@ -1,10 +1,11 @@
-"""`topspin play`: measure a policy on fixed rallies, and film the first of them."""
+"""`topspin play`: measure a policy on fixed rallies, and then film the first of them."""
 
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from threading import Event
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from pydantic import Field
 
@@ -17,8 +18,10 @@ from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from common.service.settings import LogLevel
+from common.task.states import Outcome
 from topspin.render.film import check_tools
 from topspin.render.options import FilmConfig, film
+from topspin.render.overlay import OUTCOME_WORDS, ScoreCard
 
 PROG: Final = "topspin play"
 
@@ -30,8 +33,8 @@ class PlayConfig(MatchConfig, FilmConfig):
     """
 
     often: ClassVar = (
-        *("policy", "video", "rallies", "film_rallies", "launch", "rounds"),
-        *("randomization", "camera", "slow", "json"),
+        *("policy", "video", "rallies", "film_rallies", "launch"),
+        *("randomization", "camera", "slow", "slow_at_hit", "json"),
     )
 
     policy: str = Field("default", description="a policy of the box, or a policy folder")
@@ -59,11 +62,32 @@ def main(argv: Sequence[str], stop: Event) -> int:
     found = measure(policy, folder, config, on_tick)
     if config.film_rallies:
         found["video"] = config.video
+        if not config.json_line:
+            print_measures(found, as_json=False)  # the numbers first: a film takes minutes
         task = match_task(policy.contract, config, config.expected_spin)
         rallies = evaluation_rallies(config.film_rallies, task, config.seed)
         note = f"{config.launch} balls, randomization {config.randomization}"
         # played once more, from home: a match keeps no flights
-        film(Path(config.video), record_rallies(policy.act, rallies, task), config, note, on_tick)
+        records = record_rallies(policy.act, rallies, task)
+        film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
     found["seconds"] = round(time.monotonic() - started, 2)
-    print_measures(found, config.json_line)
+    if config.json_line or not config.film_rallies:
+        print_measures(found, config.json_line)
+    else:
+        sys.stdout.write(f"film of {config.film_rallies} rallies in {config.video}\n")
     return DONE
+
+
+def score_card(found: Mapping[str, Any], policy: str) -> ScoreCard:
+    """Return a film's score card: the measures of the whole match."""
+    error = found["target_error_mean"]
+    rows = (
+        ("returned", f"{100 * found['return_rate']:.1f} %"),
+        ("caught", f"{100 * found['catch_rate']:.1f} %"),
+        ("mean distance to the target", f"{100 * error:.0f} cm" if error is not None else "–"),
+    )
+    counts = {Outcome[name.upper()]: count for name, count in found["outcomes"].items()}
+    ordered = sorted(counts.items(), key=lambda item: (item[0] != Outcome.RETURNED, -item[1]))
+    bars = tuple((OUTCOME_WORDS[outcome], count, outcome == Outcome.RETURNED) for outcome, count in ordered)
+    title = f"{Path(policy).name}: {found['rallies']:,} {found['launch']} balls"
+    return ScoreCard(title, rows, bars)

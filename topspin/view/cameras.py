@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 
 FIRST: Final[CameraName] = "side"
 _FILM_ASPECT: Final = 16 / 9
-_USUAL_ASPECT: Final = 1.35  # of a window with the panel beside the scene
+_USUAL_ASPECT: Final = 1.2  # of a window with the panel beside the scene
 
 
 def eye_of(camera: Camera, aspect: float) -> tuple[Array, Array]:

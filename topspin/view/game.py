@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
@@ -27,7 +28,7 @@ DEFAULT: Final = "default"  # policy
 class Choice:
     """What a person can change while the page runs."""
 
-    policy: str  # a name of the box, or a policy folder
+    policy: str  # a name of the box, a policy folder, or the run that is followed
     launch: PresetName
     robot: RobotChoice  # contract: the policy's own
 
@@ -56,7 +57,7 @@ class Game:
 
     def __init__(self, config: ViewConfig, run: RunFolder | None = None) -> None:
         self._config, self._run = config, run
-        first = str(run.latest_policy) if run is not None else config.policy or DEFAULT
+        first = f"run {run.root.name}" if run is not None else config.policy or DEFAULT
         self.policies = tuple(dict.fromkeys((first, *names())))  # to choose from
         self.choose(Choice(first, config.launch, config.robot))
 
@@ -89,7 +90,9 @@ class Game:
     def follow(self) -> bool:
         """Load a run's policy again if its file has changed, and return whether it has; raises PolicyError."""
         loaded = self._loaded
-        if not self._is_followed(loaded.choice) or _stamp(loaded.choice) == loaded.stamp:
+        if self._run is None or loaded.choice.policy != self.policies[0]:
+            return False
+        if _stamp(self._run.latest_policy) == loaded.stamp:
             return False
         self._loaded = self._load(loaded.choice)
         return True
@@ -110,26 +113,25 @@ class Game:
         seed, purpose = self._config.seed, Purpose.EVALUATION
         return draw_rallies(BLOCK, self._loaded.task, seed=seed, block=block, purpose=purpose)
 
-    def _is_followed(self, choice: Choice) -> bool:
-        return self._run is not None and choice.policy == self.policies[0]
-
     def _load(self, choice: Choice) -> _Loaded:
-        stamp = _stamp(choice)  # before the policy is read: a later one is then loaded again
-        policy = load_policy(policy_folder(choice.policy))
+        is_followed = self._run is not None and choice.policy == self.policies[0]
+        folder = (
+            self._run.latest_policy if self._run is not None and is_followed else policy_folder(choice.policy)
+        )
+        stamp = _stamp(folder)  # before the policy is read: a later one is then loaded again
+        policy = load_policy(folder)
         contract = policy.contract
         task = match_task(contract, self._config, self._config.expected_spin)
         robot = contract.task.robot if choice.robot == "contract" else choice.robot
         task = task.model_copy(update={"launch": choice.launch, "robot": robot})
-        label = choice.policy
-        if self._run is not None and self._is_followed(choice):
-            label = f"run {self._run.root.name}, {contract.frames / 1e6:.1f} M frames"
+        label = f"{choice.policy}, {contract.frames / 1e6:.1f} M frames" if is_followed else choice.policy
         return _Loaded(choice, policy, task, label, stamp)
 
 
-def _stamp(choice: Choice) -> tuple[int, int]:
-    """Return what changes when a policy's file is replaced; zeros where there is none."""
+def _stamp(folder: Path) -> tuple[int, int]:
+    """Return what changes when a folder's policy is replaced; zeros where there is none."""
     try:
-        found = os.stat(policy_folder(choice.policy) / WEIGHTS_FILE)
+        found = os.stat(folder / WEIGHTS_FILE)
     except OSError:
         return 0, 0
     return found.st_mtime_ns, found.st_ino

@@ -131,7 +131,9 @@ class Panel:
     def _add_choices(self, choice: Choice, policies: Sequence[str], slow: float) -> None:
         cameras = self._gui.add_button_group("Camera", get_args(Camera))
         cameras.on_click(lambda event: self._ask("camera", event.target.value, event.client_id))
-        speed = self._gui.add_slider("Speed", 0.05, 1.0, 0.05, slow, hint="1 is real time")
+        speed = self._gui.add_slider(
+            "Playback", 0.05, 1.0, 0.05, slow, hint="speed of the flight; 1 is real time"
+        )
         speed.on_update(lambda _: self._ask("slow", float(speed.value)))
         self._dropdowns = {
             "launch": self._dropdown("Balls", "launch", tuple(PRESETS), choice.launch),
@@ -149,6 +151,8 @@ class Panel:
         return dropdown
 
     def _add_sliders(self) -> None:
+        self._serve = self._button("Serve this ball", "serve")
+        self._button("Copy the ball in play", "copy")
         self._judgement = self._gui.add_html("")
         self._sliders: dict[str, viser.GuiSliderHandle[float]] = {}
         for name, (label, unit, low, high, step, _, hint) in SLIDERS.items():
@@ -157,8 +161,6 @@ class Panel:
             )
             slider.on_update(lambda _: self._ask("judge"))
             self._sliders[name] = slider
-        self._serve = self._button("Serve this ball", "serve")
-        self._button("Copy the ball in play", "copy")
 
     def _add_curves(self) -> None:
         self._progress = self._gui.add_html("")
@@ -171,7 +173,7 @@ class Panel:
                     uplot.Series(label=label, stroke=colour, width=2),
                 ),
                 scales={"x": uplot.Scale(time=False)},
-                height=190,
+                height=150,
                 visible=False,
             )
 

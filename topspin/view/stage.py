@@ -11,15 +11,16 @@ from topspin.render.scene import SPIN_RGB, TARGET_RGB, TRAIL
 from topspin.view.picture import ESTIMATE_RGB, Picture, rgb8
 from topspin.view.shapes import FLOOR_HALF, Shape, robot
 
-BACKGROUND: Final = (38, 44, 54)
+BACKGROUND: Final = (0.149, 0.173, 0.212)
+_FLOOR_RGB: Final = (0.22, 0.115, 0.105)  # darker than in films, whose lamp lights less of it
 _TRAIL_WIDTH: Final = 0.014  # [m]
 _TARGET: Final = ((0.10, 0.002, TARGET_RGB), (0.075, 0.005, (1.0, 1.0, 1.0)), (0.04, 0.008, TARGET_RGB))
 _LANDING_RADIUS: Final = 0.022  # [m]
 _DARK, _BRIGHT = (0.95, 0.42, 0.08), (1.0, 1.0, 0.97)  # the ball's two colours show its spin
 
 
-# viser's lines take linear light where everything else takes sRGB
-_LINEAR: Final = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
+# Lines, fog and what lies flat under the lamp are paler here than their colours
+_DEEPER: Final = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
 
 
 class Stage:
@@ -79,7 +80,7 @@ class Stage:
             self._trail.visible = len(picture.trail) > 0
             if len(picture.trail):
                 self._trail.points = picture.trail.astype(np.float32)
-                self._trail.colors = _LINEAR[picture.trail_colours]
+                self._trail.colors = _DEEPER[picture.trail_colours]
             self._landing.visible = picture.landing is not None
             if picture.landing is not None:
                 self._landing.position = np.append(picture.landing, 0.0025)
@@ -93,7 +94,8 @@ class Stage:
 
     def _set_up_light(self) -> None:
         scene = self._scene
-        scene.set_background_image(np.full((4, 4, 3), BACKGROUND, np.uint8))
+        scene.set_background_image(np.full((4, 4, 3), rgb8(BACKGROUND), np.uint8))
+        scene.configure_fog(near=6.5, far=13.0, color=_deep(BACKGROUND))
         scene.configure_default_lights(enabled=False)
         scene.world_axes.visible = False
         scene.add_light_hemisphere(
@@ -107,7 +109,9 @@ class Stage:
         )
 
     def _add(self, name: str, shape: Shape) -> None:
-        colour, opacity = rgb8(shape.colour), None if shape.opacity == 1.0 else shape.opacity
+        is_floor = shape.half == FLOOR_HALF
+        colour = rgb8(_FLOOR_RGB if is_floor else shape.colour)
+        opacity = None if shape.opacity == 1.0 else shape.opacity
         radius, half, third = shape.half
         if shape.form == "box":
             self._scene.add_box(
@@ -117,7 +121,7 @@ class Stage:
                 opacity=opacity,
                 position=shape.pos,
                 wxyz=shape.quat,
-                cast_shadow=shape.half != FLOOR_HALF,  # its shadow on itself would be stripes
+                cast_shadow=not is_floor,  # its shadow on itself would be stripes
             )
             return
         if shape.form == "cylinder":
@@ -141,7 +145,7 @@ class Stage:
         self, name: str, radius: float, height: float, rgb: tuple[float, float, float]
     ) -> viser.CylinderHandle:
         return self._scene.add_cylinder(
-            name, radius, height, color=rgb8(rgb), position=(0.0, 0.0, height / 2), cast_shadow=False
+            name, radius, height, color=_deep(rgb), position=(0.0, 0.0, height / 2), cast_shadow=False
         )
 
     def _arrow(self, name: str, rgb: tuple[float, float, float]) -> viser.ArrowsHandle:
@@ -154,6 +158,12 @@ class Stage:
             head_length=0.035,
             visible=False,
         )
+
+
+def _deep(rgb: tuple[float, float, float]) -> tuple[int, int, int]:
+    """Return a colour as bytes, deeper than it is."""
+    red, green, blue = (int(_DEEPER[part]) for part in rgb8(rgb))
+    return red, green, blue
 
 
 def _ball_mesh() -> trimesh.Trimesh:

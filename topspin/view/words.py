@@ -41,7 +41,7 @@ def status(playing: Playing, number: int, rally: RecordedRally, playback: Playba
     believed = estimate_at(rally, playback.time)
     guess = f"{np.linalg.norm(believed.spin):.0f} rad/s" if believed is not None else "–"
     rows = [
-        ("Ball", f"{speed:.1f} m/s"),
+        ("Speed", f"{speed:.1f} m/s"),
         ("Spin", f"{rate:.0f} rad/s, {word}"),
         ("Spin, robot's estimate", guess),
         ("Policy, robot", f"{playing.policy}, {playing.robot}"),
@@ -87,7 +87,7 @@ def scoreboard(score: Score) -> str:
         return f"<div style='{_STYLE};{_QUIET}'>no ball yet</div>"
     error = f"{100 * score.landing_error:.0f} cm" if score.returned else "–"
     rows = [
-        ("Balls", str(score.balls)),
+        ("Balls so far", str(score.balls)),
         ("Returned", f"{100 * score.return_rate:.0f} %"),
         ("Caught", f"{100 * score.catch_rate:.0f} %"),
         ("Mean distance to the target", error),
