@@ -90,8 +90,8 @@ class Command:
 COMMANDS: Final[dict[str, Command]] = {
     "train": Command(_train, "train a policy: a whole run on this machine"),
     "play": Command(_play, "measure a policy and film it"),
-    "view": Command(_view, "show a policy at play: a live page in 3-D in a browser"),
     "evaluate": Command(_evaluate, "measure a policy on fixed rallies"),
+    "view": Command(_view, "show a policy at play: a live page in 3-D in a browser"),
     "report": Command(_report, "compare runs: tables and plots beside the paper's"),
     "real2sim": Command(_real2sim, "play recordings of real balls"),
     "pictures": Command(_pictures, "draw stills of a policy's best rally"),

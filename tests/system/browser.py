@@ -15,10 +15,15 @@ from tests.system.commands import wait_until
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-quic", "--disable-sync"),
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *(
+        "--use-gl=angle",
+        "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader",
+        "--force-device-scale-factor=0.4",
+    ),
     *("--disable-background-networking", "--disable-component-update", "--remote-debugging-port=0"),
 )
-SIZE = (820, 560)  # [pixels] small: a processor draws it
+SIZE = (820, 560)  # [pixels] of the page; few of the screen, because a processor draws them
 
 # three.js shows its scenes to whoever listens here; the tests read them
 WATCH_SCENES = """

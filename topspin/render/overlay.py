@@ -52,7 +52,6 @@ class ScoreCard:
     title: str  # policy and balls
     rows: tuple[tuple[str, str], ...]  # name and value
     bars: tuple[tuple[str, int, bool], ...]  # outcome, balls, whether it is the good one
-    note: str = ""
 
 
 def rgb8(colour: Rgb) -> tuple[int, int, int, int]:
@@ -99,7 +98,7 @@ class Lettering:
         width, height = image.size
         wide, pad, step = self._px(620), self._px(28), self._px(30)
         lines = len(card.rows) + len(card.bars)
-        high = 2 * pad + self._px(52) + lines * step + self._px(14) + (step if card.note else 0)
+        high = 2 * pad + self._px(52) + lines * step + self._px(14)
         left, y = (width - wide) / 2, (height - high) / 2
         self._panel(draw, (left, y, left + wide, y + high))
         left, right, y = left + pad, left + wide - pad, y + pad
@@ -121,8 +120,6 @@ class Lettering:
             )
             draw.text((right, y), str(count), _TEXT, self._small, anchor="ra")
             y += step
-        if card.note:
-            draw.text((left, y), card.note, _QUIET, self._small)
         written: npt.NDArray[np.uint8] = np.asarray(image)
         return written
 

@@ -14,13 +14,16 @@ from common.evaluation.rally_recorder import (
 )
 from common.physics.constants import BALL_RADIUS
 from topspin.render.replay import BallPath, moment_at
-from topspin.render.scene import TRAIL, corners_of
+from topspin.render.scene import corners_of
 
 Array = npt.NDArray[np.float64]
-Bytes = npt.NDArray[np.uint8]
+Integers = npt.NDArray[np.int64]
 
 ESTIMATE_RGB: Final = (0.25, 0.95, 0.80)  # what the robot believes
-_LENGTH: Final = (0.09, 0.0012)  # length of a spin's arrow: [m], and per rate of spin [m s/rad]
+_LENGTH: Final = (
+    0.09,
+    0.0012,
+)  # length of a spin's arrow before the ball: [m], and per rate of spin [m s/rad]
 _LEAST_SPIN: Final = 1.0  # [rad/s] slower spin has no arrow
 _COMING: Final = (0, 1, 4)  # trajectory states before the hit
 
@@ -34,7 +37,7 @@ class Picture:
     ball_turn: Array  # (4,) quaternion (w, x, y, z)
     target: Array  # (2,) [m]
     trail: Array  # (n, 2, 3) [m] ends of its segments
-    trail_colours: Bytes  # (n, 2, 3)
+    trail_states: Integers  # (n,) trajectory state of each
     landing: Array | None  # (2,) [m]
     spin: Array | None  # (2, 3) [m] ends of the arrow of the true spin
     spin_estimate: Array | None  # (2, 3) [m] of the robot's estimate
@@ -76,14 +79,13 @@ def picture_at(rally: RecordedRally, path: BallPath, time: float, before: Array,
     assert moment.trail is not None
     corners = corners_of(moment.trail)
     points = moment.trail.pos[corners]
-    colours = np.array([rgb8(TRAIL[int(state)].rgb) for state in moment.trail.state[corners[1:]]], np.uint8)
     return Picture(
         joints=before + approach * (moment.joints - before),
         ball_pos=moment.ball_pos,
         ball_turn=moment.ball_turn,
         target=moment.target,
         trail=np.stack((points[:-1], points[1:]), axis=1),
-        trail_colours=np.repeat(colours.reshape(-1, 1, 3), 2, axis=1),
+        trail_states=moment.trail.state[corners[1:]],
         landing=moment.landing,
         spin=spin_arrow(moment.ball_pos, moment.ball_spin),
         spin_estimate=None if believed is None else spin_arrow(moment.ball_pos, believed.spin),
@@ -99,7 +101,8 @@ def spin_arrow(pos: Array, spin: Array) -> Array | None:
     if rate < _LEAST_SPIN:
         return None
     length = BALL_RADIUS + _LENGTH[0] + _LENGTH[1] * rate
-    return np.stack((pos, pos + length / rate * spin))
+    along = length / rate * spin
+    return np.stack((pos - 0.4 * along, pos + along))
 
 
 def rgb8(colour: tuple[float, float, float]) -> tuple[int, int, int]:

@@ -19,7 +19,7 @@ _LANDING_RADIUS: Final = 0.022  # [m]
 _DARK, _BRIGHT = (0.95, 0.42, 0.08), (1.0, 1.0, 0.97)  # the ball's two colours show its spin
 
 
-# Lines, fog and what lies flat under the lamp are paler here than their colours
+# Fog and what lies flat under the lamp are paler here than their colours
 _DEEPER: Final = np.round(255.0 * (np.arange(256) / 255.0) ** 2.2).astype(np.uint8)
 
 
@@ -46,10 +46,7 @@ class Stage:
         for number, (radius, height, rgb) in enumerate(_TARGET):
             self._disc(f"/target/{number}", radius, height, rgb)
         self._landing = self._disc("/landing", _LANDING_RADIUS, 0.005, TRAIL[3].rgb)
-        nothing = np.zeros((1, 2, 3), np.float32)
-        self._trail = self._scene.add_line_segments(
-            "/trail", nothing, (255, 255, 255), thickness=_TRAIL_WIDTH, thickness_units="world"
-        )
+        self._trails = {state: self._line(f"/trail/{state}", colour.rgb) for state, colour in TRAIL.items()}
         self._spin = self._arrow("/spin", SPIN_RGB)
         self._spin_estimate = self._arrow("/spin_estimate", ESTIMATE_RGB)
 
@@ -77,10 +74,11 @@ class Stage:
                 body.position, body.wxyz = pos, quat
             self._ball.position, self._ball.wxyz = picture.ball_pos, picture.ball_turn
             self._target.position = np.append(picture.target, 0.0)
-            self._trail.visible = len(picture.trail) > 0
-            if len(picture.trail):
-                self._trail.points = picture.trail.astype(np.float32)
-                self._trail.colors = _DEEPER[picture.trail_colours]
+            for state, line in self._trails.items():
+                points = picture.trail[picture.trail_states == state]
+                line.visible = len(points) > 0
+                if len(points):
+                    line.points = points.astype(np.float32)
             self._landing.visible = picture.landing is not None
             if picture.landing is not None:
                 self._landing.position = np.append(picture.landing, 0.0025)
@@ -148,15 +146,14 @@ class Stage:
             name, radius, height, color=_deep(rgb), position=(0.0, 0.0, height / 2), cast_shadow=False
         )
 
+    def _line(self, name: str, rgb: tuple[float, float, float]) -> viser.LineSegmentsHandle:
+        nothing = np.zeros((1, 2, 3), np.float32)
+        return self._scene.add_line_segments(name, nothing, rgb8(rgb), thickness=_TRAIL_WIDTH, visible=False)
+
     def _arrow(self, name: str, rgb: tuple[float, float, float]) -> viser.ArrowsHandle:
+        nothing, colour = np.zeros((1, 2, 3), np.float32), rgb8(rgb)
         return self._scene.add_arrows(
-            name,
-            np.zeros((1, 2, 3), np.float32),
-            rgb8(rgb),
-            shaft_radius=0.006,
-            head_radius=0.016,
-            head_length=0.035,
-            visible=False,
+            name, nothing, colour, shaft_radius=0.007, head_radius=0.026, head_length=0.05, visible=False
         )
 
 
