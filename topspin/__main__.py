@@ -30,6 +30,12 @@ def _play(argv: Sequence[str], stop: Event) -> int:
     return main(argv, stop)
 
 
+def _view(argv: Sequence[str], stop: Event) -> int:
+    from topspin.view.command import main
+
+    return main(argv, stop)
+
+
 def _evaluate(argv: Sequence[str], stop: Event) -> int:
     from topspin.evaluate import main
 
@@ -84,6 +90,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "train": Command(_train, "train a policy: a whole run on this machine"),
     "play": Command(_play, "measure a policy and film it"),
     "evaluate": Command(_evaluate, "measure a policy on fixed rallies"),
+    "view": Command(_view, "show a policy at play: a live page in 3-D in a browser"),
     "report": Command(_report, "compare runs: tables and plots beside the paper's"),
     "real2sim": Command(_real2sim, "play recordings of real balls"),
     "pictures": Command(_pictures, "draw stills of a policy's best rally"),

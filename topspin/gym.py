@@ -29,6 +29,8 @@ from common.env.rally_env import FinishedRallies, RallyEnv
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import ACTION, PAPER_OBSERVATION, Part, policy_layout
+from topspin.render.gl import Image
+from topspin.render.live import LiveDrawing
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -69,9 +71,12 @@ def _of_settings(model: type[_Model], given: dict[str, Any]) -> _Model:
         raise ValueError(f"{name or 'settings'} = {first['input']!r}; {first['msg']}") from None
 
 
-def _check_choices(render_mode: str | None, stage: int, count: int) -> None:
-    if render_mode is not None:
-        raise ValueError(f"render_mode {render_mode!r}; allowed: None (films: topspin play --video FILE)")
+def _check_choices(render_mode: str | None, modes: Sequence[str], stage: int, count: int) -> None:
+    if render_mode is not None and render_mode not in modes:
+        allowed = ", ".join(("None", *map(repr, modes)))
+        raise ValueError(
+            f"render_mode {render_mode!r}; allowed: {allowed} (films: topspin play --video FILE)"
+        )
     if stage not in (1, 2, 3):
         raise ValueError(f"stage {stage!r}; allowed: 1, 2, 3")
     if count < 1:
@@ -88,14 +93,14 @@ class _RallyBatch:
         self._experience = _of_settings(ExperienceConfig, {"hit_correction": False, **episodes})
         task = _of_settings(TaskConfig, given)
         observation = task.observation.model_copy(update={"critic": "policy"})
-        self._task = task.model_copy(update={"observation": observation})
+        self.task = task.model_copy(update={"observation": observation})
         self.observation_space = _box(policy_layout(observation))
         self.env: RallyEnv | None = None
 
     def begin(self, seed: int) -> Floats:
         """Return the first observations of a sequence of episodes that the seed alone decides."""
-        source = LocalRallies(seed, self._task)
-        self.env = RallyEnv(self._count, self._task, source, self._stage, experience=self._experience)
+        source = LocalRallies(seed, self.task)
+        self.env = RallyEnv(self._count, self.task, source, self._stage, experience=self._experience)
         return self.env.reset()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
@@ -141,17 +146,28 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
 
     Args:
         stage: Curriculum stage 1..3, the reward's column.
-        render_mode: None: films are made from recorded rallies.
+        render_mode: ``rgb_array``: ``render()`` returns a picture (540, 960, 3); ``human``: each step is shown in a
+            window, in real time; None: nothing is drawn.
         settings: Fields of ``TaskConfig`` and ``ExperienceConfig``, over ``DEFAULTS``: ``launch="strong"``,
             ``randomization="off"``, ``control_rate_hz=200`` ...
     """
 
-    metadata = {"render_modes": [], "render_fps": 50}  # noqa: RUF012  # Gymnasium's own name and form
+    metadata = {  # noqa: RUF012  # Gymnasium's own name and form
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 50,  # an environment has its own control rate
+    }
 
     def __init__(self, stage: int = 3, render_mode: str | None = None, **settings: Any) -> None:
-        _check_choices(render_mode, stage, 1)
+        _check_choices(render_mode, self.metadata["render_modes"], stage, 1)
         self.render_mode = render_mode
         self._batch = _RallyBatch(1, stage, settings)
+        self.metadata = {**self.metadata, "render_fps": self._batch.task.control_rate_hz}
+        task = self._batch.task
+        self._drawing = (
+            LiveDrawing(render_mode, task.robot, 1.0 / task.control_rate_hz)
+            if render_mode is not None
+            else None
+        )
         self.observation_space, self.action_space = self._batch.observation_space, ACTION_SPACE
         self._next_obs: Floats | None = None
 
@@ -167,11 +183,24 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         else:
             obs = self._next_obs
         self._next_obs = None
+        if self._drawing is not None:
+            self._drawing.show(self._batch.started)
         return _within(obs[0], self._batch.observation_space), {}
 
-    def render(self) -> None:
-        """Warn: there is no picture."""
-        _warn_of_rendering()
+    def render(self) -> Image | None:
+        """Return a picture (540, 960, 3) of the last step with ``rgb_array``; None otherwise.
+
+        At the end of an episode it is the picture before the last step: the environment has begun the next one.
+        """
+        if self._drawing is None:
+            _warn_of_rendering()
+            return None
+        return self._drawing.picture()
+
+    def close(self) -> None:
+        """Close the window, and free the graphics memory."""
+        if self._drawing is not None:
+            self._drawing.close()
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Play one control step."""
@@ -181,6 +210,8 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         obs = step.obs
         if step.ended.size:
             self._next_obs, obs = step.obs, step.final_obs
+        elif self._drawing is not None:
+            self._drawing.show(self._batch.started)
         info = {name: values[0] for name, values in _facts(step.finished).items() if values.size}
         return (
             _within(obs[0], self._batch.observation_space),
@@ -197,7 +228,7 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
     Args:
         num_envs: How many.
         stage: Curriculum stage 1..3, the reward's column.
-        render_mode: None: films are made from recorded rallies.
+        render_mode: None: pictures are those of one environment, and films those of recorded rallies.
         settings: As for ``RallyGymEnv``.
     """
 
@@ -214,7 +245,7 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
         render_mode: str | None = None,
         **settings: Any,
     ) -> None:
-        _check_choices(render_mode, stage, num_envs)
+        _check_choices(render_mode, self.metadata["render_modes"], stage, num_envs)
         mode = settings.pop("autoreset_mode", AutoresetMode.SAME_STEP)
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(f"autoreset_mode {mode}; allowed: {AutoresetMode.SAME_STEP}")

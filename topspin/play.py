@@ -1,7 +1,8 @@
-"""`topspin play`: measure a policy on fixed rallies, and film the first of them."""
+"""`topspin play`: measure a policy on fixed rallies, and then film the first of them."""
 
 # ruff: noqa: PLC0415 - what a command runs on is imported after its flags are read: --help answers at once
 
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +30,7 @@ class PlayConfig(MatchConfig, FilmConfig):
     often: ClassVar = {
         "What plays": ("policy",),
         "The rallies": ("rallies", "launch", "rounds", "randomization"),
-        "The film": ("video", "film_rallies", "camera", "slow"),
+        "The film": ("video", "film_rallies", "camera", "slow", "slow_at_hit"),
         "The result": ("json",),
     }
 
@@ -52,6 +53,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     from common.policy.box import policy_folder
     from common.policy.folder import load_policy
     from topspin.render.film import check_tools, film
+    from topspin.render.score_card import score_card
 
     started = time.monotonic()
     folder = policy_folder(config.policy)
@@ -65,11 +67,17 @@ def main(argv: Sequence[str], stop: Event) -> int:
     found = measure(policy, folder, config, on_tick)
     if config.film_rallies:
         found["video"] = config.video
+        if not config.json_line:
+            print_measures(found, as_json=False)  # the numbers first: a film takes minutes
         task = match_task(policy.contract, config, config.expected_spin)
         rallies = evaluation_rallies(config.film_rallies, task, config.seed)
         note = f"{config.launch} balls, randomization {config.randomization}"
         # played once more, from home: a match keeps no flights
-        film(Path(config.video), record_rallies(policy.act, rallies, task), config, note, on_tick)
+        records = record_rallies(policy.act, rallies, task)
+        film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
     found["seconds"] = round(time.monotonic() - started, 2)
-    print_measures(found, config.json_line)
+    if config.json_line or not config.film_rallies:
+        print_measures(found, config.json_line)
+    else:
+        sys.stdout.write(f"film of {config.film_rallies} rallies in {config.video}\n")
     return DONE

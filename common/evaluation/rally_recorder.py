@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from common.env.rally_env import Launches, RallyEnv
 from common.perception.camera import DETECTION, DETECTION_BUFFER, DETECTIONS, READ, detection_row
+from common.perception.flight_track import INTERCEPTION, PRESENT, SPIN
 from common.physics.constants import GRID_STEP
 from common.rally.state import RING, SAMPLE
 from common.task.config import TaskConfig
@@ -24,6 +25,13 @@ from common.task.states import Outcome
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Act = Callable[[npt.NDArray[np.float32]], npt.NDArray[np.float32]]
+
+_TRACKED = slice(PRESENT, SPIN + 3)  # of the flight filter's row: its prediction, and then the spin
+# Columns of ``RecordedRally.estimates``; the first one is the time
+INTERCEPTION_IN = 1 + INTERCEPTION - PRESENT
+INTERCEPTION_POS = slice(INTERCEPTION_IN + 1, INTERCEPTION_IN + 4)
+SPIN_ESTIMATE = slice(1 + SPIN - PRESENT, 4 + SPIN - PRESENT)
+ESTIMATE_SIZE = SPIN_ESTIMATE.stop
 
 _ROUNDS = (
     2  # a rally of an episode's last round ends when the ball lands; in earlier rounds the ball flies on
@@ -50,6 +58,9 @@ class RecordedRally:
     measurement: Array = field(default_factory=lambda: np.empty((0, SAMPLE + 1)))
     # (s, 5) the camera's detections that arrived: time, position, 1 if accepted; none in perception cheap
     detections: Array = field(default_factory=lambda: np.empty((0, DETECTION)))
+    # (m, 17) after each control step: time since launch [s], the flight filter's ``observation.PREDICTION``, and its
+    # estimate of the spin [rad/s]; no rows where the policy observes nothing of it
+    estimates: Array = field(default_factory=lambda: np.empty((0, ESTIMATE_SIZE)))
     robot: str = "rails"
 
 
@@ -79,6 +90,7 @@ class _Moment:
     joint_vel: Array  # (B, 7)
     measurement: Array  # (B, 8)
     camera_state: Array  # (B, DETECTION_BUFFER + ESTIMATE), or no rows
+    tracked: Array  # (B, ESTIMATE_SIZE - 1), or no rows
 
 
 def record_rallies(act: Act, rallies: RallyBlock, task: TaskConfig) -> list[RecordedRally]:
@@ -131,6 +143,7 @@ def _moment(env: RallyEnv) -> _Moment:
         robot.joint_vel[:, :7].copy(),
         rallies.measurement.copy(),
         rallies.camera_state.copy(),
+        rallies.track[:, _TRACKED].copy(),
     )
 
 
@@ -178,7 +191,14 @@ def _assembled(
         state=ball[:, 6].astype(np.int64),
         measurement=np.array([moment.measurement[row] for moment in moments]),
         detections=_detections(moments, row),
+        estimates=_estimates(moments, row, period),
     )
+
+
+def _estimates(moments: list[_Moment], row: int, period: float) -> Array:
+    """Return the flight filter's estimates of row ``row``'s ball, with their times."""
+    found = [[k * period, *moment.tracked[row]] for k, moment in enumerate(moments) if len(moment.tracked)]
+    return np.array(found).reshape(-1, ESTIMATE_SIZE)
 
 
 def _detections(moments: list[_Moment], row: int) -> Array:

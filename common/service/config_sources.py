@@ -22,7 +22,19 @@ RUN_TABLES: Final = (
 """Tables of a run's file, which all its programs read, each what it needs."""
 TABLES: Final = (
     *RUN_TABLES,
-    *("play", "evaluate", "pictures", "real2sim", "report", "release", "export", "certs", "router", "bench"),
+    *(
+        "play",
+        "view",
+        "evaluate",
+        "pictures",
+        "real2sim",
+        "report",
+        "release",
+        "export",
+        "certs",
+        "router",
+        "bench",
+    ),
 )
 """Tables of a settings file. A nested model of one of these names is read from that table, whatever the program."""
 SHARED: Final = (

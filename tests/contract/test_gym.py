@@ -1,14 +1,16 @@
 """Gymnasium's requirements on an environment, for the single one and the batch."""
 
 import copy
+import sys
 import warnings
+from contextlib import closing
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import vector
+from gymnasium.wrappers import RecordVideo, vector
 
 from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
@@ -16,6 +18,8 @@ from common.task.states import Outcome
 from tests.unit.env.rallies import make_env
 from topspin.gym import RallyGymEnv, RallyVectorEnv
 from topspin.gym_ids import ENV_ID
+from topspin.render.gl import RenderError
+from topspin.render.scene import Painter
 
 
 def make(**settings) -> gymnasium.Env:
@@ -42,7 +46,7 @@ def play(env: gymnasium.Env, steps: int, seed: int = 0) -> list[np.ndarray]:
 def test_gymnasiums_checker_gives_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        check_env(make().unwrapped)
+        check_env(make().unwrapped, skip_render_check=True)  # a window needs a display; pictures: below
 
 
 def test_random_play_through_all_wrappers_gives_no_warning():
@@ -302,9 +306,11 @@ def test_a_bad_setting_is_one_line_with_what_is_allowed(made, settings, message)
     assert "\n" not in str(caught.value)
 
 
-def test_a_render_mode_is_refused_and_rendering_without_one_returns_none():
-    with pytest.raises(ValueError, match="render_mode 'human'; allowed: None"):
-        RallyGymEnv(render_mode="human")
+def test_an_unknown_mode_is_refused_and_rendering_without_one_returns_none():
+    with pytest.raises(ValueError, match=r"render_mode 'ansi'; allowed: None, 'human', 'rgb_array'"):
+        RallyGymEnv(render_mode="ansi")
+    with pytest.raises(ValueError, match=r"render_mode 'rgb_array'; allowed: None \(films"):
+        RallyVectorEnv(2, render_mode="rgb_array")
     with pytest.raises(
         ValueError, match=r"autoreset_mode AutoresetMode.NEXT_STEP; allowed: AutoresetMode.SAME"
     ):
@@ -312,6 +318,54 @@ def test_a_render_mode_is_refused_and_rendering_without_one_returns_none():
     for env in (RallyGymEnv(), RallyVectorEnv(2)):
         with pytest.warns(UserWarning, match="without a render_mode returns None"):
             assert env.render() is None
+
+
+@pytest.fixture
+def graphics():
+    try:
+        Painter(64, 64).close()
+    except RenderError as error:
+        pytest.skip(f"no OpenGL here: {error}")
+
+
+@pytest.mark.usefixtures("graphics")
+def test_pictures_show_the_robot_and_the_ball_at_play():
+    with closing(make(render_mode="rgb_array")) as env:
+        assert env.render_mode == "rgb_array"
+        env.reset(seed=1)
+        pictures = [env.render()]
+        for _ in range(12):
+            env.step(env.action_space.sample())
+        pictures.append(env.render())
+
+    for picture in pictures:
+        assert (picture.shape, picture.dtype) == ((540, 960, 3), np.uint8)
+        assert picture.std() > 20  # not one colour
+    # the trail of a ball that is coming is the only thing of this blue
+    trails = [np.abs(picture - np.array([80, 180, 240])).max(axis=-1) < 45 for picture in pictures]
+    assert trails[1].sum() > trails[0].sum() + 100
+
+
+@pytest.mark.usefixtures("graphics")
+def test_record_video_writes_a_film(tmp_path):
+    pytest.importorskip("moviepy", reason="moviepy is missing: pip install moviepy")
+    folder = tmp_path / "films"
+    env = RecordVideo(make(render_mode="rgb_array"), str(folder), video_length=10, name_prefix="rally")
+    with closing(env):
+        env.reset(seed=1)
+        for _ in range(10):
+            env.step(env.action_space.sample())
+
+    assert (folder / "rally-episode-0.mp4").stat().st_size > 10_000
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems always have a display")
+def test_a_window_without_a_display_is_one_line(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+
+    with pytest.raises(RenderError, match=r"'human' needs a display, .*; allowed here: 'rgb_array'"):
+        RallyGymEnv(render_mode="human")
 
 
 def test_a_copy_is_refused_with_what_to_do():

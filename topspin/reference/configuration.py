@@ -23,6 +23,7 @@ from topspin.play import PlayConfig
 from topspin.real2sim.config import Real2SimConfig
 from topspin.release import ReleaseConfig
 from topspin.report.config import ReportConfig
+from topspin.view.config import ViewConfig
 
 PROJECT: Final = Path(__file__).parents[2]
 PROGRAMS: Final[dict[str, tuple[str, type[BaseModel]]]] = {
@@ -33,6 +34,7 @@ PROGRAMS: Final[dict[str, tuple[str, type[BaseModel]]]] = {
     "evaluator": ("python -m services.evaluator", EvaluatorConfig),
     "router": ("python -m deploy.router", RouterConfig),
     "play": ("topspin play", PlayConfig),
+    "view": ("topspin view", ViewConfig),
     "evaluate": ("topspin evaluate", EvaluateConfig),
     "report": ("topspin report", ReportConfig),
     "real2sim": ("topspin real2sim", Real2SimConfig),

@@ -16,6 +16,12 @@ class FilmConfig(BaseModel):
     slow: float = Field(
         1.0, ge=0.05, le=1, description="speed of the film; 0.25 is four times slower than real time"
     )
+    slow_at_hit: float = Field(
+        0.25,
+        ge=0.05,
+        le=1,
+        description="speed of the film around the hit, where it is slower; 1: as the rest",
+    )
     width: int = Field(
         1280,
         ge=320,

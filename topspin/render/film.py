@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -9,12 +10,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from common.evaluation.rally_recorder import RecordedRally
 from common.task.states import Outcome
 from topspin.render.config import FilmConfig
 from topspin.render.gl import Image, RenderError, wanted
-from topspin.render.overlay import OUTCOME_WORDS, Caption, Lettering
+from topspin.render.overlay import OUTCOME_WORDS, Caption, Lettering, ScoreCard
 from topspin.render.replay import BallPath, moment_at, path_of, position_at, spin_word
 from topspin.render.scene import CAMERAS, Camera, CameraName, Painter
 
@@ -22,6 +25,8 @@ log = logging.getLogger(__name__)
 
 HOLD_S: Final = 0.8  # the last picture of a rally is held, so that its text can be read
 FADE_S: Final = 0.12  # from one rally into the next
+CARD_S: Final = 4.0  # the score card at the end
+AROUND_HIT_S: Final = 0.10  # slow motion begins so long before the hit, and ends so long after it
 _QUALITY: Final = "21"  # x264's crf: a smaller one gives better and larger files
 _FOLLOWS_WITHIN_S: Final = (
     0.25  # [s] the following camera looks at the ball's mean position over this time before and after
@@ -38,6 +43,7 @@ class FilmOptions:
     height: int = 720  # [pixels] even
     rate_hz: float = 50.0  # pictures per second
     slow: float = 1.0  # rally seconds per film second
+    slow_at_hit: float = 1.0  # the same around the hit, where it is slower
     camera: CameraName = "side"
     note: str = ""  # written on every picture
 
@@ -52,15 +58,34 @@ def check_tools() -> None:
 
 def picture_times(rally: RecordedRally, options: FilmOptions) -> list[float]:
     """Return the times [s] since launch of a rally's moving pictures; the last is its end."""
-    end, step = float(rally.time[-1]), options.slow / options.rate_hz
-    return [k * step for k in range(int(end / step - 1e-9) + 1)] + [end]
+    times, time, end = [], 0.0, float(rally.time[-1])
+    while time < end - 1e-9:
+        times.append(time)
+        time += speed_at(rally, time, options) / options.rate_hz
+    return [*times, end]
 
 
-def picture_count(rallies: Sequence[RecordedRally], options: FilmOptions) -> int:
+def hit_time(rally: RecordedRally) -> float | None:
+    """Return when the racket hits the ball [s]; None where it does not."""
+    hits = np.flatnonzero(rally.state == 2)
+    return float(rally.time[hits[0]]) if len(hits) else None
+
+
+def speed_at(rally: RecordedRally, time: float, options: FilmOptions) -> float:
+    """Return the film's speed at ``time`` [s]: rally seconds per film second."""
+    hit = hit_time(rally)
+    is_near = hit is not None and abs(time - hit) < AROUND_HIT_S
+    return min(options.slow, options.slow_at_hit) if is_near else options.slow
+
+
+def picture_count(
+    rallies: Sequence[RecordedRally], options: FilmOptions, card: ScoreCard | None = None
+) -> int:
     """Return how many pictures ``pictures`` makes of ``rallies``."""
     moving = sum(len(picture_times(rally, options)) for rally in rallies)
     hold, fade = round(HOLD_S * options.rate_hz), round(FADE_S * options.rate_hz)
-    return moving + hold * len(rallies) + fade * max(len(rallies) - 1, 0)
+    last = 0 if card is None else fade + round(CARD_S * options.rate_hz)
+    return moving + hold * len(rallies) + fade * max(len(rallies) - 1, 0) + last
 
 
 def camera_at(name: CameraName, path: BallPath, time: float) -> Camera:
@@ -87,7 +112,8 @@ def caption_at(rallies: Sequence[RecordedRally], number: int, time: float, optio
         verdict = OUTCOME_WORDS[rally.outcome]
         if np.isfinite(rally.landing_error):
             verdict += f", {100 * rally.landing_error:.0f} cm from the target"
-    slow = f"{options.slow:g} x real time" if options.slow != 1.0 else ""
+    speed_now = speed_at(rally, time, options)
+    slow = f"{speed_now:g} x real time" if speed_now != 1.0 else ""
     return Caption(
         title=f"Rally {number + 1} of {len(rallies)}",
         lines=(
@@ -100,8 +126,10 @@ def caption_at(rallies: Sequence[RecordedRally], number: int, time: float, optio
     )
 
 
-def pictures(rallies: Sequence[RecordedRally], options: FilmOptions) -> Iterator[Image]:
-    """Yield a film's pictures (height, width, 3), one after the other."""
+def pictures(
+    rallies: Sequence[RecordedRally], options: FilmOptions, card: ScoreCard | None = None
+) -> Iterator[Image]:
+    """Yield a film's pictures (height, width, 3), one after the other, the score card last."""
     hold, fade = round(HOLD_S * options.rate_hz), round(FADE_S * options.rate_hz)
     lettering = Lettering(options.height)
     last: Image | None = None
@@ -112,14 +140,26 @@ def pictures(rallies: Sequence[RecordedRally], options: FilmOptions) -> Iterator
                 picture = _picture(painter, rally, path, time, options)
                 picture = lettering.write(picture, caption_at(rallies, number, time, options))
                 if index == 0 and last is not None:
-                    for k in range(fade):
-                        share = (k + 1) / (fade + 1)
-                        yield ((1.0 - share) * last + share * picture).astype(np.uint8)
+                    yield from _faded(last, picture, fade)
                 yield picture
             for _ in range(hold):
                 yield picture
             last = picture
-            log.info("filmed rally=%d of=%d outcome=%s", number + 1, len(rallies), rally.outcome.name.lower())
+            log.debug(
+                "filmed rally=%d of=%d outcome=%s", number + 1, len(rallies), rally.outcome.name.lower()
+            )
+    if card is not None and last is not None:
+        picture = lettering.write_card(last, card)
+        yield from _faded(last, picture, fade)
+        for _ in range(round(CARD_S * options.rate_hz)):
+            yield picture
+
+
+def _faded(before: Image, after: Image, count: int) -> Iterator[Image]:
+    """Yield ``count`` pictures between two."""
+    for k in range(count):
+        share = (k + 1) / (count + 1)
+        yield ((1.0 - share) * before + share * after).astype(np.uint8)
 
 
 def _picture(
@@ -186,14 +226,39 @@ def film(
     config: FilmConfig,
     note: str,
     on_tick: Callable[[], None],
+    card: ScoreCard | None = None,
 ) -> None:
-    """Write the film of ``rallies`` with ``note`` in its pictures; ``on_tick`` is called between pictures."""
-    options = FilmOptions(config.width, config.height, config.rate_hz, config.slow, config.camera, note=note)
-    log.info("filming rallies=%d pictures=%d file=%s", len(rallies), picture_count(rallies, options), path)
+    """Write the film of ``rallies`` with ``note`` in its pictures and ``card`` at its end.
+
+    ``on_tick`` is called between pictures. A terminal shows a bar with the time that is left.
+    """
+    options = FilmOptions(
+        config.width,
+        config.height,
+        config.rate_hz,
+        config.slow,
+        config.slow_at_hit,
+        config.camera,
+        note=note,
+    )
+    count = picture_count(rallies, options, card)
+    log.info("filming rallies=%d pictures=%d file=%s", len(rallies), count, path)
+    progress = Progress(
+        TextColumn("filming"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("pictures,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
 
     def frames() -> Iterator[Image]:
-        for picture in pictures(rallies, options):
+        for picture in progress.track(pictures(rallies, options, card), count):
             on_tick()
             yield picture
 
-    write_film(path, frames(), config.width, config.height, config.rate_hz)
+    with progress:
+        write_film(path, frames(), config.width, config.height, config.rate_hz)

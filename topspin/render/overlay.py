@@ -45,6 +45,15 @@ class Caption:
     legend: bool = True
 
 
+@dataclass(frozen=True, slots=True)
+class ScoreCard:
+    """The last picture of a film: what was measured."""
+
+    title: str  # policy and balls
+    rows: tuple[tuple[str, str], ...]  # name and value
+    bars: tuple[tuple[str, int, bool], ...]  # outcome, balls, whether it is the good one
+
+
 def rgb8(colour: Rgb) -> tuple[int, int, int, int]:
     """Return a colour in [0, 1] as bytes, opaque."""
     red, green, blue = (round(255 * part) for part in colour)
@@ -79,6 +88,38 @@ class Lettering:
             self._pill(draw, caption.verdict, self._large, colour, centre=width // 2, top=margin)
         if caption.legend:
             self._legend(draw, margin, height - margin)
+        written: npt.NDArray[np.uint8] = np.asarray(image)
+        return written
+
+    def write_card(self, picture: Image, card: ScoreCard) -> Image:
+        """Return the picture, darkened, with a score card in its middle."""
+        image = self._image.fromarray((0.35 * picture).astype(np.uint8))
+        draw = self._draw.Draw(image, "RGBA")
+        width, height = image.size
+        wide, pad, step = self._px(620), self._px(28), self._px(30)
+        lines = len(card.rows) + len(card.bars)
+        high = 2 * pad + self._px(52) + lines * step + self._px(14)
+        left, y = (width - wide) / 2, (height - high) / 2
+        self._panel(draw, (left, y, left + wide, y + high))
+        left, right, y = left + pad, left + wide - pad, y + pad
+        draw.text((left, y), card.title, _TEXT, self._large)
+        y += self._px(52)
+        for name, value in card.rows:
+            draw.text((left, y), name, _QUIET, self._medium)
+            draw.text((right, y), value, _TEXT, self._medium, anchor="ra")
+            y += step
+        y += self._px(14)
+        balls = max(sum(count for _, count, _ in card.bars), 1)
+        start, most = left + self._px(230), right - self._px(70)
+        for name, count, is_good in card.bars:
+            draw.text((left, y), name, _TEXT, self._small)
+            middle, end = y + self._px(10), start + max((most - start) * count / balls, self._px(4))
+            colour = rgb8(GOOD_RGB if is_good else BAD_RGB)
+            draw.rounded_rectangle(
+                (start, middle - self._px(5), end, middle + self._px(5)), self._px(5), colour
+            )
+            draw.text((right, y), str(count), _TEXT, self._small, anchor="ra")
+            y += step
         written: npt.NDArray[np.uint8] = np.asarray(image)
         return written
 

@@ -113,12 +113,7 @@ class Painter:
                 geom.category = _CASTS_NO_SHADOW  # otherwise the floor has patches of its own shadow
         for k, joints in enumerate(moment.ghosts):
             self._add_ghost(joints, _FAINTEST + 0.12 * k)
-        self._add_target(moment.target)
-        if moment.trail is not None:
-            self._add_trail(moment.trail)
-        if moment.landing is not None and np.isfinite(moment.landing).all():
-            self._add_disc(moment.landing, 0.022, 0.0050, TRAIL[3].rgb)
-        self._add_spin(moment.ball_pos, moment.ball_spin)
+        decorate(scene, moment)
         scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         return self._canvas.paint(width or self._canvas.width, height or self._canvas.height)
 
@@ -170,59 +165,72 @@ class Painter:
             if self._model.geom_bodyid[geom.objid] < self._arm:
                 geom.pos[2] = _OUT_OF_SIGHT  # geoms can't be removed from a scene
 
-    def _add_trail(self, trail: BallPath) -> None:
-        corners = corners_of(trail)
-        for start, end in pairwise(corners):
-            self._add_line(
-                _CAPSULE, _TRAIL_RADIUS, trail.pos[start], trail.pos[end], TRAIL[int(trail.state[end])].rgb
-            )
 
-    def _add_target(self, target: Array) -> None:
-        for radius, height, rgb in (
-            (_TARGET_RADIUS, 0.0020, TARGET_RGB),
-            (0.75 * _TARGET_RADIUS, 0.0030, (1.0, 1.0, 1.0)),
-            (0.40 * _TARGET_RADIUS, 0.0040, TARGET_RGB),
-        ):
-            self._add_disc(target, radius, height, rgb)
+def decorate(scene: mujoco.MjvScene, moment: Moment) -> None:
+    """Add target, trail, landing and spin to a scene; where it is full, the rest is left out."""
+    for radius, height, rgb in (
+        (_TARGET_RADIUS, 0.0020, TARGET_RGB),
+        (0.75 * _TARGET_RADIUS, 0.0030, (1.0, 1.0, 1.0)),
+        (0.40 * _TARGET_RADIUS, 0.0040, TARGET_RGB),
+    ):
+        _add_disc(scene, moment.target, radius, height, rgb)
+    if moment.trail is not None:
+        _add_trail(scene, moment.trail)
+    if moment.landing is not None and np.isfinite(moment.landing).all():
+        _add_disc(scene, moment.landing, 0.022, 0.0050, TRAIL[3].rgb)
+    _add_spin(scene, moment.ball_pos, moment.ball_spin)
 
-    def _add_disc(self, centre: Array, radius: float, height: float, rgb: tuple[float, float, float]) -> None:
-        """Add a flat disc on the table, its top ``height`` [m] above the table's."""
-        geom = self._next_geom()
-        if geom is None:
-            return
-        size, pos = np.array([radius, height / 2, 0.0]), np.array([centre[0], centre[1], height / 2])
-        mujoco.mjv_initGeom(
-            geom, _CYLINDER.value, size, pos, np.eye(3).ravel(), np.array([*rgb, 1.0], np.float32)
-        )
-        geom.emission, geom.specular = 0.1, 0.0
 
-    def _add_spin(self, pos: Array, spin: Array) -> None:
-        """Add the spin's axis as an arrow: the ball turns around it by the right-hand rule."""
-        rate = float(np.linalg.norm(spin))
-        if rate < 1.0:
-            return
-        axis = spin / rate
-        length = BALL_RADIUS + _SPIN_LENGTH[0] + _SPIN_LENGTH[1] * rate
-        self._add_line(_ARROW, 0.004, pos - 0.4 * length * axis, pos + length * axis, SPIN_RGB)
+def _add_trail(scene: mujoco.MjvScene, trail: BallPath) -> None:
+    for start, end in pairwise(corners_of(trail)):
+        rgb = TRAIL[int(trail.state[end])].rgb
+        _add_line(scene, _CAPSULE, _TRAIL_RADIUS, trail.pos[start], trail.pos[end], rgb)
 
-    def _add_line(
-        self, kind: mujoco.mjtGeom, width: float, start: Array, end: Array, rgb: tuple[float, float, float]
-    ) -> None:
-        geom = self._next_geom()
-        if geom is None:
-            return
-        nothing = np.zeros(3)
-        mujoco.mjv_initGeom(
-            geom, kind.value, nothing, nothing, np.eye(3).ravel(), np.array([*rgb, 1.0], np.float32)
-        )
-        mujoco.mjv_connector(geom, kind.value, width, start, end)
-        geom.emission, geom.specular = 0.2, 0.0
 
-    def _next_geom(self) -> mujoco.MjvGeom | None:
-        """Return the scene's next free geom; None where it is full."""
-        scene = self._canvas.scene
-        if scene.ngeom >= scene.maxgeom:
-            return None
-        scene.ngeom += 1
-        geom: mujoco.MjvGeom = scene.geoms[scene.ngeom - 1]
-        return geom
+def _add_disc(
+    scene: mujoco.MjvScene, centre: Array, radius: float, height: float, rgb: tuple[float, float, float]
+) -> None:
+    """Add a flat disc on the table, its top ``height`` [m] above the table's."""
+    geom = _next_geom(scene)
+    if geom is None:
+        return
+    size, pos = np.array([radius, height / 2, 0.0]), np.array([centre[0], centre[1], height / 2])
+    colour = np.array([*rgb, 1.0], np.float32)
+    mujoco.mjv_initGeom(geom, _CYLINDER.value, size, pos, np.eye(3).ravel(), colour)
+    geom.emission, geom.specular = 0.1, 0.0
+
+
+def _add_spin(scene: mujoco.MjvScene, pos: Array, spin: Array) -> None:
+    """Add the spin's axis as an arrow: the ball turns around it by the right-hand rule."""
+    rate = float(np.linalg.norm(spin))
+    if rate < 1.0:
+        return
+    axis = spin / rate
+    length = BALL_RADIUS + _SPIN_LENGTH[0] + _SPIN_LENGTH[1] * rate
+    _add_line(scene, _ARROW, 0.004, pos - 0.4 * length * axis, pos + length * axis, SPIN_RGB)
+
+
+def _add_line(
+    scene: mujoco.MjvScene,
+    kind: mujoco.mjtGeom,
+    width: float,
+    start: Array,
+    end: Array,
+    rgb: tuple[float, float, float],
+) -> None:
+    geom = _next_geom(scene)
+    if geom is None:
+        return
+    nothing, colour = np.zeros(3), np.array([*rgb, 1.0], np.float32)
+    mujoco.mjv_initGeom(geom, kind.value, nothing, nothing, np.eye(3).ravel(), colour)
+    mujoco.mjv_connector(geom, kind.value, width, start, end)
+    geom.emission, geom.specular = 0.2, 0.0
+
+
+def _next_geom(scene: mujoco.MjvScene) -> mujoco.MjvGeom | None:
+    """Return the scene's next free geom; None where it is full."""
+    if scene.ngeom >= scene.maxgeom:
+        return None
+    scene.ngeom += 1
+    geom: mujoco.MjvGeom = scene.geoms[scene.ngeom - 1]
+    return geom

@@ -83,10 +83,10 @@ def read(run: str, which: str = "best") -> Run:
         settings = tomllib.loads(folder.config.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RunError(f"{folder.config} is not TOML: {error}") from None
-    training = _training(folder.metrics)
+    training = training_curve(folder.metrics)
     if training is None:
         missing.append("no epochs in metrics.csv: frames, hours and stages are unknown")
-    curve = _curve(folder.evaluations, training)
+    curve = evaluation_curve(folder.evaluations, training)
     if curve is None:
         missing.append(f"no evaluations in report/{folder.evaluations.name}: it has no training curves")
     policy = None
@@ -111,14 +111,16 @@ def _column(rows: list[dict[str, str]], name: str) -> Array:
     return np.array([float(row.get(name) or "nan") for row in rows])
 
 
-def _training(path: Path) -> TrainingCurve | None:
+def training_curve(path: Path) -> TrainingCurve | None:
+    """Return a run's epochs from its metrics.csv; None before the first."""
     rows = whole_rows(path)
     if not rows:
         return None
     return TrainingCurve(*(_column(rows, name) for name in ("frames", "seconds", "stage")))
 
 
-def _curve(path: Path, training: TrainingCurve | None) -> Curve | None:
+def evaluation_curve(path: Path, training: TrainingCurve | None) -> Curve | None:
+    """Return a run's evaluations from its evaluations.csv; None before the first."""
     rows = whole_rows(path)
     if not rows:
         return None

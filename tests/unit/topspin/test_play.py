@@ -55,6 +55,20 @@ def test_play_films_the_first_rallies(folder, tmp_path, capsys):
     assert video.stat().st_size > 10_000
 
 
+def test_the_numbers_come_before_the_film(folder, tmp_path, capsys, monkeypatch):
+    printed = []
+    monkeypatch.setattr(play, "check_tools", lambda: None)
+    monkeypatch.setattr(play, "film", lambda *given: printed.extend((capsys.readouterr().out, given[-1])))
+
+    play.main(["--policy", str(folder), "--rallies", "6", "--film-rallies", "1"], Event())
+
+    numbers, card = printed
+    assert "return_rate" in numbers
+    assert card.title == "policy: 6 paper balls"
+    assert sum(count for _, count, _ in card.bars) == 6
+    assert "film of 1 rallies" in capsys.readouterr().out
+
+
 def test_play_stops_on_request(folder):
     stop = Event()
     stop.set()

@@ -12,7 +12,7 @@ from tests.unit.topspin.render.recorded import make_moment, make_rally, make_rec
 from topspin.render.film import FilmOptions, picture_count, pictures, write_film
 from topspin.render.gl import RenderError, wanted
 from topspin.render.hall import load_hall
-from topspin.render.overlay import OUTCOME_WORDS
+from topspin.render.overlay import OUTCOME_WORDS, Lettering, ScoreCard
 from topspin.render.replay import BallPath
 from topspin.render.scene import CAMERAS, TARGET_RGB, TRAIL, Camera, CameraName, Painter
 from topspin.render.stills import rally_picture, rally_strip, save_png, showpiece
@@ -127,6 +127,17 @@ def test_ghosts_are_faint_and_only_of_the_arm(painter):
     assert ghost.max() < robot.max()
 
 
+def test_a_score_card_is_written_over_a_darker_picture():
+    picture = np.full((180, 320, 3), 200, np.uint8)
+    bars = (("returned", 9, True), ("missed", 1, False))
+
+    card = Lettering(180).write_card(picture, ScoreCard("default", (("returned", "90 %"),), bars)).astype(int)
+
+    assert card[0, 0].max() < 100
+    green, orange = (card[..., 1] - card[..., 0] > 60, card[..., 0] - card[..., 2] > 60)
+    assert green.sum() > 5 * orange.sum() > 0  # bars as long as the balls are many
+
+
 @pytest.mark.usefixtures("painter")
 def test_a_film_is_h264_of_the_expected_length_and_size(tmp_path):
     ffmpeg = wanted("imageio_ffmpeg")
@@ -134,13 +145,17 @@ def test_a_film_is_h264_of_the_expected_length_and_size(tmp_path):
     options = FilmOptions(320, 180, slow=0.5, note="test")
     path = tmp_path / "new folder" / "play.mp4"
 
-    count = write_film(path, pictures(rallies, options), 320, 180, options.rate_hz)
+    card = ScoreCard(
+        "default: 2 balls", (("returned", "50.0 %"),), (("returned", 1, True), ("missed", 1, False))
+    )
+
+    count = write_film(path, pictures(rallies, options, card), 320, 180, options.rate_hz)
 
     frames, seconds = ffmpeg.count_frames_and_secs(str(path))
     reader = ffmpeg.read_frames(str(path))
     about = next(reader)
     reader.close()
-    assert frames == count == picture_count(rallies, options)
+    assert frames == count == picture_count(rallies, options, card)
     assert seconds == pytest.approx(count / 50.0, abs=0.02)
     assert about["codec"] == "h264"
     assert about["size"] == (320, 180)

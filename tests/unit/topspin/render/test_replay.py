@@ -3,7 +3,7 @@ import pytest
 
 from common.physics.constants import BALL_RADIUS
 from tests.unit.topspin.render.recorded import make_rally, make_recorded
-from topspin.render.film import FilmOptions, caption_at, picture_times
+from topspin.render.film import AROUND_HIT_S, FilmOptions, caption_at, picture_times
 from topspin.render.replay import moment_at, path_of, path_until, position_at, spin_word
 from topspin.render.scene import corners_of
 from topspin.render.stills import part_times
@@ -85,6 +85,22 @@ def test_slow_motion_takes_more_pictures_of_the_same_time(slow, count):
     assert len(times) == count
     assert times[-1] == pytest.approx(0.095)
     np.testing.assert_allclose(np.diff(times)[:-1], 0.02 * slow)
+
+
+def test_the_film_is_slow_only_around_the_hit():
+    hit_at_half_a_second = np.where(np.arange(201) < 100, 1, 2)
+    rally, options = make_rally(201, state=hit_at_half_a_second), FilmOptions(slow_at_hit=0.25)
+
+    times = np.array(picture_times(rally, options))
+
+    steps, near = np.diff(times)[:-1], np.abs(times[:-2] - 0.5) < AROUND_HIT_S
+    np.testing.assert_allclose(steps[near], 0.005)
+    np.testing.assert_allclose(steps[~near], 0.02)
+    assert times[-1] == 1.0
+    assert "0.25 x real time" in caption_at([rally], 0, 0.5, options).note
+    assert caption_at([rally], 0, 0.2, options).note == ""
+    assert len(picture_times(rally, FilmOptions())) == 51
+    assert len(picture_times(make_rally(201), options)) == 51  # nobody hit it
 
 
 def test_the_verdict_is_written_once_the_rally_is_over():
