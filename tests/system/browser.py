@@ -161,5 +161,5 @@ def browser():
         finally:
             for tab in tabs:
                 tab.close()
-            process.terminate()
-            process.wait(20)
+            process.kill()  # a friendly end takes it 20 s
+            process.wait()

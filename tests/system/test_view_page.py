@@ -49,6 +49,10 @@ def test_a_person_watches_pauses_and_asks_for_balls(tmp_path):
         tab.click("Next ball")
         tab.wait(f"(document.body.innerText.match(/Ball (\\d+)/) || [])[1] > {before}", "another ball")
 
+        # slow motion
+        tab.write("Playback", "0.5")
+        tab.wait("/slow motion 0.5 x/.test(document.body.innerText)", "slow motion")
+
         # another launch preset has other balls: elite ones are faster than all of paper
         tab.click("paper")
         tab.click("elite")

@@ -108,7 +108,7 @@ class Page:
             case "next":
                 self._next()
             case "slow":
-                self._playback = replace(self._playback, speed=float(request.value or 1.0))
+                self._playback = replace(self._playback, speed=self._panel.speed)
             case "serve":
                 self._serve()
             case "copy":
@@ -142,7 +142,7 @@ class Page:
 
     def _choose(self, choice: Choice) -> None:
         """Play on with another choice; the ball in play is not counted, and the score begins again."""
-        if choice == self._game.choice:
+        if choice == self._game.choice or not self._panel.offers(choice):
             return
         try:
             self._game.choose(choice)
@@ -187,7 +187,7 @@ def chosen(choice: Choice, request: Request) -> Choice:
     """Return a choice with what is asked for."""
     match request.what:
         case "policy":
-            return replace(choice, policy=str(request.value))
+            return replace(choice, policy=request.value)
         case "launch":
             return replace(choice, launch=cast(PresetName, request.value))
         case _:

@@ -20,6 +20,7 @@ from topspin.view.score import Score
 
 What = Literal["pause", "next", "slow", "serve", "copy", "judge", "policy", "launch", "robot", "camera"]
 TITLE: Final = "Topspin"
+_SPEEDS: Final = (0.05, 1.0)  # [-] of real time
 _ROBOTS: Final = ("contract", *get_args(RobotName))
 _HINTS: Final[dict[What, str]] = {
     "launch": "kind of ball: a launch preset",
@@ -34,7 +35,7 @@ class Request:
     """What a person asks for."""
 
     what: What
-    value: str | float | None = None  # the choice, or the speed
+    value: str = ""  # the choice
     client: int | None = None  # of whose tab the camera is
 
 
@@ -84,7 +85,16 @@ class Panel:
     @property
     def ball(self) -> ServedBall:
         """The ball of the sliders."""
-        return ServedBall(**{name: float(slider.value) for name, slider in self._sliders.items()})
+        return ServedBall(*(_within(self._sliders[name], s.low, s.high) for name, s in SLIDERS.items()))
+
+    @property
+    def speed(self) -> float:
+        """The speed of the flight [-] of real time."""
+        return _within(self._speed, *_SPEEDS)
+
+    def offers(self, choice: Choice) -> bool:
+        """Return whether a choice is one of those that are offered: a browser can send anything."""
+        return all(getattr(choice, name) in dropdown.options for name, dropdown in self._dropdowns.items())
 
     def show_ball(self, ball: ServedBall) -> None:
         """Set the sliders."""
@@ -120,7 +130,7 @@ class Panel:
             plot.visible = len(curves.minutes) > 1
             plot.data = (curves.minutes, getattr(curves, name))
 
-    def _ask(self, what: What, value: str | float | None = None, client: int | None = None) -> None:
+    def _ask(self, what: What, value: str = "", client: int | None = None) -> None:
         self.requests.put(Request(what, value, client))
 
     def _button(self, label: str, what: What) -> viser.GuiButtonHandle:
@@ -131,10 +141,10 @@ class Panel:
     def _add_choices(self, choice: Choice, policies: Sequence[str], slow: float) -> None:
         cameras = self._gui.add_button_group("Camera", get_args(Camera))
         cameras.on_click(lambda event: self._ask("camera", event.target.value, event.client_id))
-        speed = self._gui.add_slider(
-            "Playback", 0.05, 1.0, 0.05, slow, hint="speed of the flight; 1 is real time"
+        self._speed = self._gui.add_slider(
+            "Playback", *_SPEEDS, 0.05, slow, hint="speed of the flight; 1 is real time"
         )
-        speed.on_update(lambda _: self._ask("slow", float(speed.value)))
+        self._speed.on_update(lambda _: self._ask("slow"))
         self._dropdowns = {
             "launch": self._dropdown("Balls", "launch", tuple(PRESETS), choice.launch),
             "robot": self._dropdown("Robot", "robot", _ROBOTS, choice.robot),
@@ -176,6 +186,11 @@ class Panel:
                 height=150,
                 visible=False,
             )
+
+
+def _within(slider: viser.GuiSliderHandle[float], low: float, high: float) -> float:
+    """Return a slider's value, within its ends whatever a browser sends."""
+    return min(max(float(slider.value), low), high)
 
 
 def _change(handle: Any, text: str) -> None:
