@@ -76,7 +76,7 @@ docs: $(STAMP)            ## the documentation as pages: build/site/index.html
 
 lock:                     ## lock the newest allowed releases of all dependencies (after make install)
 	$(LOCK) --extra dev --output-file requirements/dev.lock
-	$(LOCK) --output-file requirements/services.lock
+	$(LOCK) --constraint requirements/dev.lock --output-file requirements/services.lock
 
 audit: $(STAMP)           ## ask for known vulnerabilities of the locked dependencies
 	$(BIN)/pip-audit --disable-pip --require-hashes --requirement requirements/dev.lock

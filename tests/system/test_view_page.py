@@ -6,7 +6,8 @@ import signal
 import pytest
 
 from tests.system import browser as browsers
-from tests.system.commands import running, wait_until
+from tests.system.commands import running
+from tests.waiting import wait_until
 
 pytest.importorskip("viser", reason="viser is missing: pip install -e '.[view]'")
 pytestmark = pytest.mark.skipif(browsers.CHROMIUM is None, reason="no Chromium here")

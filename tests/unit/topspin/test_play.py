@@ -11,6 +11,7 @@ from tests.unit.evaluation.test_match import make_policy
 from topspin import evaluate, play
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
+from topspin.render import film as film_module
 from topspin.render.gl import RenderError
 from topspin.render.scene import Painter
 
@@ -57,8 +58,10 @@ def test_play_films_the_first_rallies(folder, tmp_path, capsys):
 
 def test_the_numbers_come_before_the_film(folder, tmp_path, capsys, monkeypatch):
     printed = []
-    monkeypatch.setattr(play, "check_tools", lambda: None)
-    monkeypatch.setattr(play, "film", lambda *given: printed.extend((capsys.readouterr().out, given[-1])))
+    monkeypatch.setattr(film_module, "check_tools", lambda: None)
+    monkeypatch.setattr(
+        film_module, "film", lambda *given: printed.extend((capsys.readouterr().out, given[-1]))
+    )
 
     play.main(["--policy", str(folder), "--rallies", "6", "--film-rallies", "1"], Event())
 
