@@ -47,6 +47,11 @@ class View:
         if key == ("learner", "0"):
             self._remember(status)
 
+    def forget(self, role: str, id_: str) -> None:
+        """Show a service no longer: it was asked to end."""
+        self.statuses.pop((role, id_), None)
+        self.heard.pop((role, id_), None)
+
     def _remember(self, learner: Status) -> None:
         frames, stage = learner.counters.get("frames", 0.0), int(learner.gauges.get("stage", 0))
         while self.history and self.history[-1].frames > frames:  # it went back to a checkpoint

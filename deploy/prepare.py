@@ -26,6 +26,7 @@ from common.service.table import whole_rows
 from deploy.config import CONNECT_S, SECTION, DeployConfig
 from deploy.supervisor import Spec
 from deploy.topology import ROLES, Role
+from deploy.topology import role as role_named
 from services.learner.budget import ENDING_S, Budget
 
 
@@ -82,6 +83,12 @@ class PreparedRun:
         found = [replace(keeper, keeps_run=True, again=resumed, made=self.newest_checkpoint)]
         found += [service(role, i) for role in workers for i in range(role.count(config))]
         return found
+
+    def actor(self, number: int) -> Spec:
+        """Return one more actor than the settings have; it serves its metrics at the next free port."""
+        port = str(self.config.metrics_port)
+        arguments = role_named("actor").arguments(str(number), str(self.folder.config), port)
+        return Spec(f"actor-{number}", "actor", arguments, restart=True)
 
 
 def last_epoch(folder: RunFolder) -> dict[str, str]:

@@ -20,6 +20,7 @@ from common.service.whole_file import write_whole
 from deploy.history import points_of
 from deploy.panel import View, render
 from deploy.prepare import PreparedRun, RunFailedError, open_link
+from deploy.scaling import changes, wanted
 from deploy.supervisor import Supervisor
 from deploy.targets import TargetsFile
 from deploy.watchdog import Watchdog
@@ -71,9 +72,11 @@ def watch(
         targets = stack.enter_context(
             closing(TargetsFile(run.folder.targets, run.name, run.config.metrics_host))
         )
+        run.folder.wanted_actors.unlink(missing_ok=True)  # of an earlier life
         while not stop.is_set() and not supervisor.has_ended(LEARNER):
             now = time.monotonic()
             supervisor.watch(now)
+            scale(run, view, supervisor)
             watcher.look(now)
             targets.update(view.statuses.values(), supervisor.children)
             end_hung(watchdog, supervisor, view, now)
@@ -87,6 +90,29 @@ def watch(
             transport.wait(WATCH_S)
             stop.wait(0.05)  # heartbeats of many services must not keep this loop busy
     set_up_logging("info", "deploy", log_file)
+
+
+def scale(run: PreparedRun, view: View, supervisor: Supervisor) -> None:
+    """Start and end actors until there are as many as `topspin scale` asks for."""
+    for name in supervisor.forget_retired():
+        view.forget("actor", name.removeprefix("actor-"))
+        log.info("actor has ended name=%s", name)
+    actors = wanted(run.folder)
+    if actors is None:
+        return
+    present = {
+        int(name.removeprefix("actor-")): child
+        for name, child in supervisor.children.items()
+        if child.spec.role == "actor"
+    }
+    more, fewer = changes(present, actors)
+    for number in more:
+        log.info("one more actor name=actor-%d", number)
+        supervisor.add(run.actor(number))
+    for number in fewer:
+        if present[number].spec.restart:
+            log.info("an actor shall end name=actor-%d", number)
+        supervisor.retire(f"actor-{number}")
 
 
 def end_hung(watchdog: Watchdog, supervisor: Supervisor, view: View, now: float) -> None:

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from common.service.config_sources import ENVIRONMENT_PREFIX
@@ -157,6 +157,26 @@ class Supervisor:
             status,
             self.last_line(child.spec.name),
         )
+
+    def add(self, spec: Spec) -> None:
+        """Start one more process."""
+        self.children[spec.name] = Child(spec, self._start(spec), time.monotonic())
+
+    def retire(self, name: str) -> None:
+        """Ask a process to end, once; it is not started again."""
+        child = self.children[name]
+        if child.spec.restart:
+            child.spec = replace(child.spec, restart=False)
+            child.has_ended = child.restart_at is not None  # it is dead already, and stays so
+            with suppress(ProcessLookupError):
+                child.process.terminate()
+
+    def forget_retired(self) -> list[str]:
+        """Return the retired processes that have ended since the last call; they are no longer among the children."""
+        ended = [name for name, child in self.children.items() if child.has_ended and not child.spec.restart]
+        for name in ended:
+            _close_pipe(self.children.pop(name).process)
+        return ended
 
     def has_ended(self, name: str) -> bool:
         """Return whether a process has ended and is not started again; `watch` notes it."""

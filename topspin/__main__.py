@@ -24,6 +24,12 @@ def _train(argv: Sequence[str], stop: Event) -> int:
     return main(argv, stop, prog="topspin train")
 
 
+def _scale(argv: Sequence[str], stop: Event) -> int:
+    from topspin.scale import main
+
+    return main(argv, stop)
+
+
 def _play(argv: Sequence[str], stop: Event) -> int:
     from topspin.play import main
 
@@ -88,6 +94,7 @@ class Command:
 
 COMMANDS: Final[dict[str, Command]] = {
     "train": Command(_train, "train a policy: a whole run on this machine"),
+    "scale": Command(_scale, "give a running training more or fewer actors"),
     "play": Command(_play, "measure a policy and film it"),
     "evaluate": Command(_evaluate, "measure a policy on fixed rallies"),
     "view": Command(_view, "show a policy at play: a live page in 3-D in a browser"),

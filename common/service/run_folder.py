@@ -97,6 +97,11 @@ class RunFolder:
         return self.root / "targets.json"
 
     @property
+    def wanted_actors(self) -> Path:
+        """How many actors the run is asked to have, while it runs."""
+        return self.root / "actors"
+
+    @property
     def report(self) -> Path:
         """Evaluations and reports."""
         return self.root / "report"

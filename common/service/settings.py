@@ -2,13 +2,14 @@
 
 import os
 import time
-from typing import Literal
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.comms.zenoh_config import LinkConfig, ZenohConfig
 from common.service.endpoint import FIRST_PORT
 
+MOST_ACTORS: Final = 1000
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 
@@ -47,7 +48,7 @@ class Fleet(BaseModel):
     actors: int = Field(
         1,
         ge=1,
-        le=1000,
+        le=MOST_ACTORS,
         description="actors of the run: a dataset is one rollout of each, and they share 256 environments",
     )
     generators: int = Field(1, ge=1, le=100, description="generators of the run")

@@ -1,0 +1,58 @@
+"""More or fewer actors of a run that is running: how many are wanted, and what to start and end for it.
+
+`topspin scale` writes the number into the run's folder, and `deploy.local` reads it. Who may write there may change the
+run: no message of an open hub can.
+"""
+
+import tomllib
+from collections.abc import Iterable
+
+from common.comms.certificates import files_of
+from common.errors import ReportedError
+from common.service.run_folder import RunAliveError, RunFolder
+from common.service.settings import MOST_ACTORS
+from common.service.whole_file import write_whole
+
+
+def ask(folder: RunFolder, actors: int) -> None:
+    """Ask the process that keeps a run on this machine for so many actors.
+
+    Raises:
+        ReportedError: No `topspin train` keeps the run, or there is no certificate for one of the actors.
+    """
+    check_certificates(folder, actors)
+    try:
+        folder.check_free_of("deploy.local")
+    except RunAliveError:
+        write_whole(folder.wanted_actors, f"{actors}\n")
+        return
+    raise ReportedError(
+        f"no topspin train keeps the run {folder.root}: allowed: the name of a run that is running"
+    )
+
+
+def check_certificates(folder: RunFolder, actors: int) -> None:
+    """Raise ReportedError if the run has certificates, and none for one of its actors."""
+    settings = tomllib.loads(folder.config.read_text()) if folder.config.is_file() else {}
+    certificates = str(settings.get("tls", ""))
+    for number in range(actors if certificates else 0):
+        if not files_of(certificates, f"actor-{number}").certificate.exists():
+            raise ReportedError(
+                f"actor-{number} has no certificate in {certificates}; make it with topspin certs --out {certificates} "
+                f"--add actor-{number}, and start the run again with --resume: its hub reads the folder when it starts"
+            )
+
+
+def wanted(folder: RunFolder) -> int | None:
+    """Return how many actors are asked for, or None: nobody asked, or for a number that is not allowed."""
+    try:
+        text = folder.wanted_actors.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return int(text) if text.isdecimal() and len(text) < 6 and 1 <= int(text) <= MOST_ACTORS else None
+
+
+def changes(present: Iterable[int], actors: int) -> tuple[list[int], list[int]]:
+    """Return the numbers of the actors to start and of those to end: actors 0, 1, ... remain."""
+    now = set(present)
+    return sorted(set(range(actors)) - now), sorted(number for number in now if number >= actors)
