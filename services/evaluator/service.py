@@ -13,6 +13,7 @@ from common.evaluation.match import evaluation_rallies, play_match
 from common.evaluation.measures import measures
 from common.policy.contract import PolicyError, contract_hash, contract_of
 from common.policy.folder import Policy, load_policy, save_policy
+from common.policy.normalizer import Moments
 from common.policy.weights import install, new_network
 from common.service.member import Member
 from common.service.metrics import Metrics
@@ -104,13 +105,8 @@ class EvaluatorService:
             self._asked = None
             self._next_play = now + IDLE_WAIT_S
             snapshot = self._read(answer.payload) if isinstance(answer, Reply) else None
-            # Before its first update a run has no policy worth keeping, and actors and learner need the cores
-            if snapshot and snapshot.frames and (snapshot.generation, snapshot.version) != self._played:
-                self._played = (snapshot.generation, snapshot.version)
-                self._member.state = "playing"
-                self._evaluate(snapshot)
-                self._next_play = self._clock() + self._config.interval_s
-                self._member.state = "waiting"
+            if snapshot and (snapshot.generation, snapshot.version) != self._played:
+                self._take(snapshot)
         self._beat()
 
     def _beat(self) -> None:
@@ -141,14 +137,30 @@ class EvaluatorService:
             self._member.refuse("policy", error)
             return None
 
-    def _evaluate(self, snapshot: PolicySnapshot) -> None:
-        config, started = self._config, self._clock()
+    def _take(self, snapshot: PolicySnapshot) -> None:
+        """Evaluate a policy that is new, unless it is of another task or not trained yet."""
+        moments = self._installed(snapshot)
+        # Before its first update a run has no policy worth keeping, and actors and learner need the cores
+        if moments is not None and not snapshot.frames:
+            return
+        self._played = (snapshot.generation, snapshot.version)
+        if moments is not None:
+            self._member.state = "playing"
+            self._evaluate(snapshot, moments)
+            self._member.state = "waiting"
+        self._next_play = self._clock() + self._config.interval_s
+
+    def _installed(self, snapshot: PolicySnapshot) -> Moments | None:
+        """Return the moments of a policy whose weights the network has now, or None if it is refused."""
         try:
-            layout = critic_layout(config.task.observation)
-            moments = install(self._network, snapshot, layout, self._contract_hash, "evaluator")
+            layout = critic_layout(self._config.task.observation)
+            return install(self._network, snapshot, layout, self._contract_hash, "evaluator")
         except PolicyError as error:
             self._member.refuse("policy", error)
-            return
+            return None
+
+    def _evaluate(self, snapshot: PolicySnapshot, moments: Moments) -> None:
+        config, started = self._config, self._clock()
         contract = contract_of(
             config.task,
             config.experience,
