@@ -45,7 +45,10 @@ def test_the_version_is_the_packages():
 
 @pytest.mark.parametrize(
     ("word", "line"),
-    [("pley", "unknown command 'pley'; did you mean 'play'?"), ("x", "allowed: train, play, evaluate")],
+    [
+        ("pley", "unknown command 'pley'; did you mean 'play'?"),
+        ("x", "allowed: train, scale, play, evaluate"),
+    ],
 )
 def test_an_unknown_command_is_one_line(word, line):
     with pytest.raises(ConfigError, match=line):
