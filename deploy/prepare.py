@@ -11,7 +11,7 @@ from threading import Event
 
 from pydantic import ValidationError
 
-from common.comms.certificates import checked, files_of
+from common.comms.certificates import checked, missing
 from common.comms.keys import Keys
 from common.comms.roles import OPERATOR_NAME, name_of
 from common.comms.transport import Transport
@@ -216,11 +216,8 @@ def check_certificates(config: DeployConfig) -> None:
     """Raise an error that names the certificates that a run lacks or can't use; nothing without TLS."""
     if not config.tls:
         return
-    missing = [
-        name for name in certificate_names(config) if not files_of(config.tls, name).certificate.exists()
-    ]
-    if missing:
-        names = ",".join(missing)
+    if found := missing(config.tls, certificate_names(config)):
+        names = ",".join(found)
         raise ConfigError(
             f"--tls {config.tls} has no certificate of {names}; make them with: topspin certs --out {config.tls} "
             f"--add {names}"

@@ -7,7 +7,7 @@ run: no message of an open hub can.
 import tomllib
 from collections.abc import Iterable
 
-from common.comms.certificates import files_of
+from common.comms.certificates import missing
 from common.errors import ReportedError
 from common.service.run_folder import RunAliveError, RunFolder
 from common.service.settings import MOST_ACTORS
@@ -35,12 +35,13 @@ def check_certificates(folder: RunFolder, actors: int) -> None:
     """Raise ReportedError if the run has certificates, and none for one of its actors."""
     settings = tomllib.loads(folder.config.read_text()) if folder.config.is_file() else {}
     certificates = str(settings.get("tls", ""))
-    for number in range(actors if certificates else 0):
-        if not files_of(certificates, f"actor-{number}").certificate.exists():
-            raise ReportedError(
-                f"actor-{number} has no certificate in {certificates}; make it with topspin certs --out {certificates} "
-                f"--add actor-{number}, and start the run again with --resume: its hub reads the folder when it starts"
-            )
+    if not certificates:
+        return
+    for name in missing(certificates, (f"actor-{number}" for number in range(actors))):
+        raise ReportedError(
+            f"{name} has no certificate in {certificates}; make it with topspin certs --out {certificates} "
+            f"--add {name}, and start the run again with --resume: its hub reads the folder when it starts"
+        )
 
 
 def wanted(folder: RunFolder) -> int | None:

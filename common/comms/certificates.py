@@ -14,7 +14,7 @@ certificate of a learner is valid for a hub, at the hosts that it names.
 import os
 import socket
 import ssl
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -52,6 +52,11 @@ def files_of(folder: str | Path, name: str) -> Files:
     """Return the files of one name, such as ``actor-0``, in a folder."""
     root = Path(folder)
     return Files(root / f"{CA}.pem", root / f"{name}.pem", root / f"{name}.key")
+
+
+def missing(folder: str | Path, names: Iterable[str]) -> list[str]:
+    """Return those of the names that have no certificate in a folder."""
+    return [name for name in names if not files_of(folder, name).certificate.exists()]
 
 
 def names_in(folder: str | Path) -> tuple[str, ...]:
