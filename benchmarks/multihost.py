@@ -16,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -28,6 +28,7 @@ import tomli_w
 from pydantic import Field
 
 from benchmarks.chaos.check import NOT_ACCOUNTED, RULES, check, kept_epochs, learner_lives, lines, names
+from benchmarks.chaos.tail import Tail
 from benchmarks.hosts import Host, local_network
 from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.errors import ReportedError
@@ -79,6 +80,7 @@ class Site:
     hosts: list[Host]
     actors: int
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    _learner: Tail | None = None
     _commands: dict[str, tuple[Host, tuple[str, ...]]] = field(default_factory=dict)
 
     @property
@@ -176,9 +178,11 @@ class Site:
                     f"{name} ended with status {process.returncode}: {self.folder / name}.log"
                 )
 
-    def epochs(self) -> list[Mapping[str, Any]]:
+    def epochs(self) -> list[dict[str, Any]]:
         """Return what the learner's history has of each epoch, of all lives."""
-        return [event for event in lines(self.history / "learner-0.jsonl") if event["event"] == "trained"]
+        if self._learner is None:
+            self._learner = Tail(self.history / "learner-0.jsonl")
+        return [event for event in self._learner.events() if event["event"] == "trained"]
 
     def _collect(self, name: str, timeout_s: float) -> None:
         process = self.processes[name]

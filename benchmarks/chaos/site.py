@@ -5,7 +5,6 @@ as on other hosts: ``far`` in a network namespace, ``slow`` behind a wire that c
 router.
 """
 
-import json
 import os
 import shutil
 import signal
@@ -22,6 +21,7 @@ from typing import Any, Final
 import psutil
 
 from benchmarks.chaos.slow_wire import SlowWire
+from benchmarks.chaos.tail import Tail
 from benchmarks.hosts import ip, system
 from common.errors import ReportedError
 from deploy.prepare import free_port
@@ -72,7 +72,7 @@ class Site:
     _namespace: str = ""
     _deploy: subprocess.Popen[bytes] | None = None
     _has_disk: bool = False
-    _read: dict[str, tuple[int, list[dict[str, Any]]]] = field(default_factory=dict)
+    _tails: dict[str, Tail] = field(default_factory=dict)
 
     @property
     def work(self) -> Path:
@@ -228,17 +228,8 @@ class Site:
 
     def _events(self, name: str) -> list[dict[str, Any]]:
         """Return the events of a history so far; only what is new is read."""
-        at, events = self._read.get(name, (0, []))
-        file = self.history / f"{name}.jsonl"
-        if file.exists():
-            with file.open("rb") as source:
-                source.seek(at)
-                whole, _, _ = source.read().rpartition(b"\n")
-            if whole:
-                events += [json.loads(line) for line in whole.split(b"\n")]
-                at += len(whole) + 1
-        self._read[name] = at, events
-        return events
+        tail = self._tails.setdefault(name, Tail(self.history / f"{name}.jsonl"))
+        return tail.events()
 
     # ---- what faults change
 
