@@ -51,6 +51,12 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
         pattern=r"^$|^(tcp|tls|unixsock-stream)/.+",
         description="where the learner listens; empty: a free port on this machine",
     )
+    learners: int = Field(
+        1,
+        ge=1,
+        le=64,
+        description="learners that train together, each with a core and its share of the actors",
+    )
     resume: bool = Field(False, exclude=True, description="go on with runs/RUN from its newest checkpoint")
     metrics_port: int = Field(
         FIRST_PORT,

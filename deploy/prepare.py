@@ -80,6 +80,10 @@ class PreparedRun:
         # checkpoint starts from the beginning.
         learner, *workers = ROLES
         keeper = service(learner, 0, *(resumed() if config.resume else ()))
+        if config.learners > 1:
+            _module, *flags = keeper.arguments
+            group = ("deploy.learners", str(config.learners), str(self.folder.logs))
+            keeper = replace(keeper, arguments=(*group, *flags))
         found = [replace(keeper, keeps_run=True, again=resumed, made=self.newest_checkpoint)]
         found += [service(role, i) for role in workers for i in range(role.count(config))]
         return found
@@ -209,6 +213,7 @@ def write(config: DeployConfig, name: str, folder: RunFolder, endpoint: str) -> 
 def certificate_names(config: DeployConfig) -> tuple[str, ...]:
     """Return the names of the certificates that a run needs: of its services, and of this process."""
     services = [name_of(role.name, str(i)) for role in ROLES for i in range(role.count(config))]
+    services += [name_of("learner", str(rank)) for rank in range(1, config.learners)]
     return (*services, OPERATOR_NAME)
 
 

@@ -141,6 +141,7 @@ class Supervisor:
     def _note_death(self, child: Child, status: int, now: float) -> None:
         """Record that a process has ended, and when it is started again."""
         child.exits.append(status)
+        _end_group(child.process)
         life_s = now - child.started
         before, child.made = child.made, child.spec.made()
         is_new = is_a_new_row(child.spec, status, life_s, child.made != before)
@@ -184,8 +185,7 @@ class Supervisor:
 
     def kill(self, name: str) -> None:
         """End a process that hangs; `watch` starts it again."""
-        with suppress(ProcessLookupError):
-            self.children[name].process.kill()
+        _end_group(self.children[name].process)
 
     def has_bad_config(self) -> str:
         """Return the name of a process whose settings can't be used, so that no restart helps, or ""."""
@@ -218,7 +218,7 @@ class Supervisor:
                 process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 log.warning("process pid=%d did not end within %.0f s and is killed", process.pid, patience_s)
-                process.kill()
+                _end_group(process)
                 process.wait()
         for name in names:
             _close_pipe(self.children[name].process)
@@ -244,6 +244,12 @@ def _launch(arguments: Sequence[str], log_file: Path) -> subprocess.Popen[bytes]
             env=environment,
             start_new_session=True,  # a Ctrl-C reaches only this process, which stops the others in order
         )
+
+
+def _end_group(process: subprocess.Popen[bytes]) -> None:
+    """End a process at once, and what it has started and left behind."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
 
 
 def _close_pipe(process: subprocess.Popen[bytes]) -> None:

@@ -53,21 +53,35 @@ def hung(pulses: Mapping[str, Pulse], hub: str, now: float, limit_s: float) -> l
     ]
 
 
+def family(process: int) -> list[int]:
+    """Return a process and those that it has started, and so on."""
+    found = [process]
+    for children in Path(f"/proc/{process}/task").glob("*/children"):
+        with suppress(OSError):  # a thread that has just ended
+            for child in children.read_text().split():
+                found += family(int(child))
+    return found
+
+
 def cpu_seconds(process: int) -> float | None:
-    """Return the CPU time that a process has used [s], or None where the system does not tell."""
+    """Return the CPU time that a process and its children have used [s], or None where the system does not tell."""
     try:
-        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        stats = [Path(f"/proc/{one}/stat").read_text().rpartition(")")[2].split() for one in family(process)]
+        return sum(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")
     except (OSError, ValueError, IndexError):
         return None
 
 
 def wants_a_core(process: int) -> bool:
-    """Return whether a thread of a process is running, or would be if a core were free; False if it can't be told."""
-    for stat in Path(f"/proc/{process}/task").glob("*/stat"):
-        with suppress(OSError):  # a thread that has just ended
-            if stat.read_text().rpartition(")")[2].split()[:1] == ["R"]:
-                return True
+    """Return whether a thread of a process or its children is running, or would be if a core were free.
+
+    False if it can't be told.
+    """
+    for one in family(process):
+        for stat in Path(f"/proc/{one}/task").glob("*/stat"):
+            with suppress(OSError):  # a thread that has just ended
+                if stat.read_text().rpartition(")")[2].split()[:1] == ["R"]:
+                    return True
     return False
 
 

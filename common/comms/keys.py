@@ -1,33 +1,35 @@
 """All keys of the services, and the matching of key expressions with keys.
 
-topspin/v2/<run>/policy                          latest policy: put as a hint; late joiners request it
-topspin/v2/<run>/stage                           stage changes: put as a hint; an actor then requests the policy,
+topspin/v3/<run>/policy                          latest policy: put as a hint; late joiners request it
+topspin/v3/<run>/stage                           stage changes: put as a hint; an actor then requests the policy,
                                                  which contains its stage. A request returns all changes
-topspin/v2/<run>/rollout/<actor>                 rollouts of one actor: requests to the learner; the reply is the
+topspin/v3/<run>/rollout/<rank>/<actor>          rollouts of one actor: requests to its learner; the reply is the
                                                  verdict
-topspin/v2/<run>/report/<actor>                  reports of one actor: requests to the learner; the reply is a
+topspin/v3/<run>/report/<rank>/<actor>           reports of one actor: requests to its learner; the reply is a
                                                  verdict with new credits
-topspin/v2/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
-topspin/v2/<run>/ctl/<role>/<id>                 commands to one service
-topspin/v2/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
-topspin/v2/<run>/status/<role>/<id>              heartbeats with cumulative counters
+topspin/v3/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
+topspin/v3/<run>/ctl/<role>/<id>                 commands to one service
+topspin/v3/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
+topspin/v3/<run>/status/<role>/<id>              heartbeats with cumulative counters
 
 A key names its sender wherever a certificate can stand for it (`common.comms.roles`). Receivers refuse a message that
 names another one.
 """
 
 import re
+import zlib
 from dataclasses import dataclass
 from typing import Final
 
 from common.comms.budgets import ID_PATTERN, one_line
 from common.errors import ConfigError
 
-PREFIX: Final = "topspin/v2"
+PREFIX: Final = "topspin/v3"
 ROLES: Final = ("generator", "actor", "learner", "evaluator")
 
 # A part contains no wildcard (* $ # ?), no separator (/) and not Zenoh's verbatim mark (@).
 _PART: Final = re.compile(ID_PATTERN)
+_LAST_NUMBER: Final = re.compile(r"[0-9]+$")
 LONGEST_NUMBER: Final = 19  # digits of an incarnation: it fits into 64 bits
 
 
@@ -61,21 +63,29 @@ class Keys:
         """Return the key of stage changes."""
         return f"{PREFIX}/{self.run}/stage"
 
-    def rollout(self, actor: str) -> str:
-        """Return the key for the rollouts of one actor."""
-        return f"{PREFIX}/{self.run}/rollout/{_part('id', actor)}"
+    def rollout(self, actor: str, rank: int = 0) -> str:
+        """Return the key for the rollouts of one actor to a learner of this rank."""
+        return f"{PREFIX}/{self.run}/rollout/{_number('rank', rank)}/{_part('id', actor)}"
 
-    def every_rollout(self) -> str:
-        """Return the expression that matches the rollouts of all actors."""
-        return f"{PREFIX}/{self.run}/rollout/*"
+    def every_rollout(self, rank: int = 0) -> str:
+        """Return the expression that matches the rollouts of all actors to a learner of this rank."""
+        return f"{PREFIX}/{self.run}/rollout/{_number('rank', rank)}/*"
 
-    def report(self, actor: str) -> str:
-        """Return the key for the reports of one actor."""
-        return f"{PREFIX}/{self.run}/report/{_part('id', actor)}"
+    def rollouts_to_any(self, actor: str) -> str:
+        """Return the expression that matches the rollouts of one actor to any learner."""
+        return f"{PREFIX}/{self.run}/rollout/*/{_part('id', actor)}"
 
-    def every_report(self) -> str:
-        """Return the expression that matches the reports of all actors."""
-        return f"{PREFIX}/{self.run}/report/*"
+    def report(self, actor: str, rank: int = 0) -> str:
+        """Return the key for the reports of one actor to a learner of this rank."""
+        return f"{PREFIX}/{self.run}/report/{_number('rank', rank)}/{_part('id', actor)}"
+
+    def every_report(self, rank: int = 0) -> str:
+        """Return the expression that matches the reports of all actors to a learner of this rank."""
+        return f"{PREFIX}/{self.run}/report/{_number('rank', rank)}/*"
+
+    def reports_to_any(self, actor: str) -> str:
+        """Return the expression that matches the reports of one actor to any learner."""
+        return f"{PREFIX}/{self.run}/report/*/{_part('id', actor)}"
 
     def rally(self, shard: int) -> str:
         """Return the key of the valid rallies of one shard (0, 1, ...)."""
@@ -101,10 +111,6 @@ class Keys:
     def every_alive(self) -> str:
         """Return the expression that matches all liveliness tokens of the run."""
         return f"{PREFIX}/{self.run}/alive/**"
-
-    def every_alive_of(self, role: str) -> str:
-        """Return the expression that matches the liveliness tokens of one role."""
-        return f"{PREFIX}/{self.run}/alive/{_role(role)}/**"
 
     def every_life_of(self, role: str, id_: str) -> str:
         """Return the expression that matches the liveliness tokens of one service."""
@@ -135,6 +141,15 @@ class Keys:
                 f"key {one_line(alive_key, 200)!r} is not {PREFIX}/{self.run}/alive/<role>/<id>/<incarnation>"
             )
         return Member(role=_role(parts[0]), id=_part("id", parts[1]), incarnation=int(parts[2]))
+
+
+def rank_of(actor: str, ranks: int) -> int:
+    """Return the rank of the learner that an actor sends its rollouts to, of a group with so many ranks.
+
+    Actors that are numbered one after another are divided evenly.
+    """
+    number = _LAST_NUMBER.search(actor)
+    return (int(number[0]) if number else zlib.crc32(actor.encode())) % ranks
 
 
 def matches(key_expr: str, key: str) -> bool:

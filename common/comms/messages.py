@@ -89,6 +89,7 @@ class PolicySnapshot:
     obs_mean: Annotated[F64, Wire("as the observation", "<f8", "D")]
     obs_var: Annotated[F64, Wire("its square", "<f8", "D", low=0)]
     obs_count: Count
+    ranks: Annotated[int, Wire("1", low=1, high=1024)] = 1  # learners that train together (`keys.rank_of`)
 
 
 @dataclass(frozen=True, slots=True)

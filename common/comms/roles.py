@@ -30,12 +30,22 @@ class Rights:
     watch: tuple[str, ...] = ()  # those of others
 
 
+def _rank(learner: str) -> int:
+    """Return the rank of a learner; of one that is not in any group it is 0."""
+    return int(learner) if learner.isdecimal() else 0
+
+
+def _led(keys: Keys, learner: str) -> tuple[str, ...]:
+    """Return the keys of what only the leading learner says."""
+    return () if _rank(learner) else (keys.policy(), keys.stage())
+
+
 ROLES: Final[Mapping[str, Callable[[Keys, str], Rights]]] = MappingProxyType(
     {
         "learner": lambda keys, id_: Rights(
-            publish=(keys.policy(), keys.stage(), keys.status("learner", id_)),
+            publish=(*_led(keys, id_), keys.status("learner", id_)),
             answer=(
-                *(keys.policy(), keys.stage(), keys.every_rollout(), keys.every_report()),
+                *(*_led(keys, id_), keys.every_rollout(_rank(id_)), keys.every_report(_rank(id_))),
                 keys.ctl("learner", id_),
             ),
             show=(keys.every_life_of("learner", id_),),
@@ -44,10 +54,10 @@ ROLES: Final[Mapping[str, Callable[[Keys, str], Rights]]] = MappingProxyType(
         "actor": lambda keys, id_: Rights(
             publish=(keys.status("actor", id_),),
             subscribe=(keys.policy(), keys.stage(), keys.every_rally()),
-            ask=(keys.rollout(id_), keys.report(id_), keys.policy(), keys.every_rally()),
+            ask=(keys.rollouts_to_any(id_), keys.reports_to_any(id_), keys.policy(), keys.every_rally()),
             answer=(keys.ctl("actor", id_),),
             show=(keys.every_life_of("actor", id_),),
-            watch=(keys.every_alive_of("learner"),),
+            watch=(keys.every_life_of("learner", "0"),),
         ),
         "generator": lambda keys, id_: Rights(
             publish=(keys.every_rally(), keys.status("generator", id_)),

@@ -22,7 +22,7 @@ from common.service.settings import ServiceConfig
 
 log = logging.getLogger(__name__)
 
-LEARNER_ID: Final = "0"  # a run has one learner
+LEARNER_ID: Final = "0"  # of the learner that keeps the run; others of its group are 1, 2, ...
 REFUSED_KINDS: Final = MappingProxyType(
     {
         "learner": ("control", "alive", "contract", "report", "rollout"),

@@ -7,6 +7,7 @@ from threading import Event
 from typing import Final
 
 from common.comms.codec import DecodeError, decode, encode
+from common.comms.keys import rank_of
 from common.comms.messages import (
     ActorReport,
     PolicySnapshot,
@@ -17,7 +18,7 @@ from common.comms.messages import (
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.policy.contract import PolicyError
 from common.service.history import History
-from common.service.member import Member
+from common.service.member import LEARNER_ID, Member
 from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
@@ -86,7 +87,8 @@ class ActorService:
         self._policies = transport.subscribe(keys.policy(), capacity=1)
         self._stages = transport.subscribe(keys.stage(), capacity=64)
         self._member.watch("stage", self._stages)
-        self._learners = transport.watch_alive(keys.every_alive_of("learner"))
+        self._learners = transport.watch_alive(keys.every_life_of("learner", LEARNER_ID))
+        self._rank: int | None = None  # of the learner that takes this actor's rollouts
         self._ready: float | None = None  # [s] time of the first policy
         self._reconnects = transport.reconnect_count
         self._frames = 0
@@ -161,9 +163,10 @@ class ActorService:
             now = time.monotonic()
             self._note_learners()
             self._take_verdicts(now)
-        pending = self._send_report(leaving=True, timeout_s=LAST_REPORT_S)
-        if pending.wait() is NoReply.TIMEOUT:
-            log.warning("the learner did not answer the last report")
+        if self._rank is not None:
+            pending = self._send_report(leaving=True, timeout_s=LAST_REPORT_S)
+            if pending.wait() is NoReply.TIMEOUT:
+                log.warning("the learner did not answer the last report")
         self._beat()
         self._member.leave()
         self._history.note("end", in_flight=[flight.sequence for flight in self._outbox.flights])
@@ -225,7 +228,7 @@ class ActorService:
             self._told.add(reason)
             log.warning("waiting for=%r seconds=%.0f", reason, now - self._idle_since)
         outcome = self._report.poll() if self._report else NoReply.TIMEOUT
-        if outcome is not None and now >= self._next_report:
+        if outcome is not None and now >= self._next_report and self._rank is not None:
             self._next_report = now + self._report_after_s
             self._report = self._send_report(leaving=False, timeout_s=5.0)
 
@@ -300,6 +303,7 @@ class ActorService:
             if fault := objection(self._following, snapshot.generation):
                 self._member.refuse("policy", fault)
                 return
+            self._rank = rank_of(self._config.id, snapshot.ranks)
             self._player.adopt(snapshot)
         except (DecodeError, PolicyError) as error:
             self._member.refuse("policy", error)
@@ -338,7 +342,7 @@ class ActorService:
                 self._metrics.inc("topspin_rollouts_retried_total", 1.0)
             self._history.note("sent", number=flight.sequence, tries=flight.tries + 1)
             self._pending[flight.sequence] = self._transport.request(
-                self._keys.rollout(self._config.id),
+                self._keys.rollout(self._config.id, self._rank or 0),
                 flight.payload,
                 self._config.outbox.request_timeout_s,
                 Flow.ROLLOUT,
@@ -430,7 +434,7 @@ class ActorService:
         outbox = self._outbox
         self._known_credits = (outbox.generation, outbox.credit_limit, outbox.credit_version)
         return self._transport.request(
-            self._keys.report(self._config.id), encode(report), timeout_s, Flow.CONTROL
+            self._keys.report(self._config.id, self._rank or 0), encode(report), timeout_s, Flow.CONTROL
         )
 
     # ---- numbers

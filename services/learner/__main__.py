@@ -1,16 +1,22 @@
-"""Run the learner: `python -m services.learner`."""
+"""Run the learner: `python -m services.learner`, or several that train together: `torchrun -m services.learner`."""
 
 # ruff: noqa: PLC0415 - what a service runs on is imported after its flags are read: --help answers at once
 
+import os
+import socket
 import sys
 from collections.abc import Sequence
 from threading import Event
+from typing import TYPE_CHECKING
 
 from common.comms.keys import Keys
 from common.service.config import first_look, load
 from common.service.process import DONE, run_service
 from common.service.run_folder import RunFolder
 from services.learner.config import LearnerConfig
+
+if TYPE_CHECKING:
+    from services.learner.group import Group
 
 PROG = "python -m services.learner"
 
@@ -34,8 +40,27 @@ def settings(argv: Sequence[str]) -> LearnerConfig:
 
 
 def main(stop: Event) -> int:
-    """Run the service until it is done or asked to stop; return the exit status."""
+    """Run one learner until it is done or asked to stop; return the exit status.
+
+    torchrun tells each of its processes its rank. Rank 0 leads, and its settings are those of all.
+    """
+    if os.environ.get("RANK", "0") != "0":
+        return follow(stop)
     config = settings(sys.argv[1:])
+    from services.learner.group import ALONE, join
+
+    if "WORLD_SIZE" not in os.environ:
+        return lead(config, ALONE, stop)
+    group = join()
+    try:
+        return lead(config, group, stop)
+    finally:
+        group.leave()
+
+
+def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
+    """Run the learner that keeps the run."""
+    from common.comms.zenoh_config import endpoint_for_others
     from common.service.connection import connected
     from services.learner import checkpoint
     from services.learner.service import LearnerService
@@ -48,7 +73,27 @@ def main(stop: Event) -> int:
         folder.held_by("learner"),
         connected("learner", config, stop) as (transport, metrics),
     ):
-        LearnerService(config, transport, metrics).run(stop)
+        if group.size > 1:
+            endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
+            group.of_leader(config.model_copy(update={"endpoint": endpoint}).model_dump_json().encode())
+        LearnerService(config, transport, metrics, group=group).run(stop)
+    return DONE
+
+
+def follow(stop: Event) -> int:
+    """Run a learner that trains with the leading one, with its settings."""
+    from common.service.connection import connected
+    from services.learner.follower import FollowerService
+    from services.learner.group import join
+
+    group = join()
+    try:
+        leaders = LearnerConfig.model_validate_json(group.of_leader(b""))
+        config = leaders.model_copy(update={"id": str(group.rank), "mode": "client"})
+        with connected("learner", config, stop) as (transport, metrics):
+            FollowerService(config, transport, metrics, group).run(stop)
+    finally:
+        group.leave()
     return DONE
 
 

@@ -71,6 +71,10 @@ class Accounts:
         """Closed lives, oldest first."""
         return tuple(self._closed)
 
+    def alive(self) -> list[Account]:
+        """Return the accounts of all lives that there are now."""
+        return [self._accounts[life] for life in self._living]
+
     def get(self, life: Life) -> Account | None:
         """Return the account of a life, or None."""
         return self._accounts.get(life)

@@ -28,6 +28,7 @@ class Identity:
     generation: int  # number of this life of the learner
     contract_hash: str
     training_hash: str
+    ranks: int = 1  # learners that train together
 
 
 class Broadcast:
@@ -118,5 +119,6 @@ class Broadcast:
                 obs_mean=training.obs_moments.mean,
                 obs_var=training.obs_moments.var,
                 obs_count=training.obs_moments.count,
+                ranks=identity.ranks,
             )
         )

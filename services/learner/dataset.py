@@ -101,6 +101,7 @@ def read(
     for rollout in rollouts:
         parts.append(_part(rollout, model, distillation, log_std))
         on_tick()
+    parts = parts or [_nothing(model)]
     group = model.group
     own = np.stack(
         [np.concatenate([getattr(part, name) for part in parts]) for name in ("values", "advantages")]
@@ -143,7 +144,8 @@ def _gathered_moments(own: Sequence[Moments], group: Group) -> list[Moments]:
     """Return the moments of every rank's rollouts, in the order of ranks."""
     rows = np.array([[*moments.mean, *moments.var, moments.count] for moments in own])
     size = (rows.shape[1] - 1) // 2
-    return [Moments(row[:size], row[size:-1], int(row[-1])) for rank in group.gathered(rows) for row in rank]
+    every = (row for rank in group.gathered(rows) for row in rank)
+    return [Moments(row[:size], row[size:-1], int(row[-1])) for row in every if row[-1]]
 
 
 @torch.no_grad()
@@ -179,4 +181,22 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
         advantages=advantage.reshape(-1),
         values=values.reshape(-1),
         moments=Moments.of(r.obs.reshape(-1, model.obs_size)),
+    )
+
+
+def _nothing(model: Model) -> _Part:
+    """Return no frames at all: of a rank whose actors have brought nothing for this dataset."""
+    none = torch.zeros(0)
+    network = model.network_pass.network
+    actions = torch.zeros((0, len(network.log_std)))
+    return _Part(
+        obs=torch.zeros((0, model.obs_size), dtype=model.network_pass.dtype),
+        actions=actions,
+        log_mu=none,
+        log_prox=none,
+        mean=actions,
+        corrections=actions,
+        advantages=np.zeros(0, np.float32),
+        values=np.zeros(0, np.float32),
+        moments=Moments(np.zeros(model.obs_size), np.zeros(model.obs_size), 0),
     )

@@ -119,6 +119,8 @@ class EpochStats:
 
 def play_counts(rollouts: Sequence[Rollout]) -> npt.NDArray[np.float64]:
     """Return what ``merged`` takes: counts and sums over the rallies that ended in ``rollouts``, as one vector."""
+    if not rollouts:  # a rank of a group may bring none
+        return np.zeros(8 + len(Outcome) + len(TERMS))
     episodes = [rollout.episodes for rollout in rollouts]
     outcome = np.concatenate([e.outcome for e in episodes])
     rated = ~np.concatenate([e.unvalidated for e in episodes])

@@ -65,6 +65,8 @@ class Intake:
         closed: Iterable[Life] = (),
     ) -> None:
         self._config = config.for_actors(1)  # a size that is not worked out yet is one actor's
+        # Rollouts that this learner brings into a dataset: all, unless it trains in a group
+        self.part = self._config.dataset_rollouts
         self._learner_state = learner
         self._queue: deque[Queued] = deque(queue)
         kept: dict[Life, set[int]] = {}
@@ -73,6 +75,7 @@ class Intake:
         self._accounts = Accounts(snapshots, kept, closed)
         self._credits = Credits(config.window, config.credit_patience_s)
         self._in_update: tuple[Queued, ...] = ()
+        self._is_updating = False
         self._now = 0.0
         self._misfits: dict[Life, Misfit] = {}
         self._new_misfits: list[Misfit] = []
@@ -108,6 +111,16 @@ class Intake:
     def report_after_s(self) -> float:
         """Pause between two reports of a waiting actor [s]: all together send `IDLE_REPORTS_HZ`."""
         return min(max(SOONEST_REPORT_S, self._accounts.living / IDLE_REPORTS_HZ), LATEST_REPORT_S)
+
+    def contributors(self, now: float) -> tuple[int, int]:
+        """Return how many actors live that may bring rollouts, and how many of them do, at ``now`` [s].
+
+        One that has credits and brings nothing for `credit_patience_s` hangs, or is far too slow.
+        """
+        patience = self._config.credit_patience_s
+        able = [account for account in self._accounts.alive() if account.fits]
+        active = sum(not a.credit_limit or now - a.last_progress < patience for a in able)
+        return len(able), active
 
     def take_new_misfits(self) -> list[Misfit]:
         """Return the misfits that were found since the last call, each life of an actor once."""
@@ -208,24 +221,29 @@ class Intake:
             self._set_alive(life, False)
         self._accounts.close_old(now)
 
-    def take_dataset(self) -> tuple[Queued, ...]:
-        """Return the rollouts of the next dataset, oldest first, and start its update; () while too few wait.
+    def take(self, count: int) -> tuple[Queued, ...]:
+        """Return the oldest ``count`` rollouts, and start their update.
 
         Raises:
             RuntimeError: An update is running: `finish_update` must come first.
         """
-        if self._in_update:
+        if self._is_updating:
             raise RuntimeError(f"an update of {len(self._in_update)} rollouts is running")
-        if len(self._queue) < self._config.dataset_rollouts:
-            return ()
-        self._in_update = tuple(self._queue.popleft() for _ in range(self._config.dataset_rollouts))
+        self._in_update = tuple(self._queue.popleft() for _ in range(count))
+        self._is_updating = True
         return self._in_update
+
+    def take_dataset(self) -> tuple[Queued, ...]:
+        """Return the next dataset of a learner that trains alone, oldest first; () while too few rollouts wait."""
+        if len(self._queue) < self.part and not self._is_updating:
+            return ()
+        return self.take(self.part)
 
     def finish_update(self, learner: LearnerState) -> tuple[Queued, ...]:
         """Record the dataset as trained; return the waiting rollouts that the new version can't use: they are lost."""
         for entry in self._in_update:
             self._settle(entry, Fate.TRAINED)
-        self._in_update = ()
+        self._in_update, self._is_updating = (), False
         self._learner_state = learner
         waiting, self._queue = self._queue, deque()
         lost = []
@@ -302,11 +320,12 @@ class Intake:
 
         A rollout after the last dataset of a stage would be accepted and then lost at the stage change.
         """
-        datasets = self._learner_state.datasets_left - bool(self._in_update)
-        return max(0, min(self._config.queue_rollouts, datasets * self._config.dataset_rollouts))
+        datasets = self._learner_state.datasets_left - self._is_updating
+        return max(0, min(self._config.queue_rollouts, datasets * self.part))
 
     def _version_at_use(self) -> int:
-        datasets_before = len(self._queue) // self._config.dataset_rollouts + bool(self._in_update)
+        whole = len(self._queue) // self.part if self.part else 0
+        datasets_before = whole + self._is_updating
         return self._learner_state.version + datasets_before
 
     def _known(self, header: Header) -> Outcome | None:
@@ -332,5 +351,5 @@ class Intake:
         """Return how many more rollouts of the present version are needed within the target lag."""
         # nothing is collected for the time after a stage change: it would be lost
         ahead = min(self._config.lag_aimed_at + 1, self._learner_state.datasets_left)
-        datasets = ahead - bool(self._in_update)
-        return datasets * self._config.dataset_rollouts - len(self._queue)
+        datasets = ahead - self._is_updating
+        return datasets * self.part - len(self._queue)

@@ -10,6 +10,7 @@ from common.errors import ReportedError
 from common.service.member import Member
 from services.learner.config import LearnerConfig
 from services.learner.generation import yields
+from services.learner.group import Group
 from services.learner.intake import Intake
 
 log = logging.getLogger(__name__)
@@ -30,8 +31,8 @@ class Members:
         config: Of the learner.
         transport: The hub, or a connection to one.
         member: The learner as a member of its run.
-        generation: Of the learner.
-        intake: Is told which actors live.
+        intake: Is told which actors live, of this rank's.
+        group: Which rank of the group the learner is.
         clock: Returns seconds.
     """
 
@@ -40,12 +41,15 @@ class Members:
         config: LearnerConfig,
         transport: Transport,
         member: Member,
-        generation: int,
         intake: Intake,
+        group: Group,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config, self._transport, self._member = config, transport, member
-        self._generation, self._intake, self._clock = generation, intake, clock
+        self._generation, self._intake, self._group, self._clock = (
+            *(member.incarnation, intake, group),
+            clock,
+        )
         self._tokens = transport.watch_alive(member.keys.every_alive())
         self._alive: set[tuple[str, str, int]] = set()
         self._joined: float | None = None  # [s] time of the learner's own token
@@ -92,7 +96,7 @@ class Members:
             life = (member.role, member.id, member.incarnation)
             changes[event.alive].append(f"{member.role}/{member.id}")
             (self._alive.add if event.alive else self._alive.discard)(life)
-            if member.role == "actor":
+            if member.role == "actor" and self._group.owns(member.id):
                 (self._intake.seen if event.alive else self._intake.gone)(member.id, member.incarnation)
         for is_alive, names in changes.items():
             if names:
@@ -102,7 +106,9 @@ class Members:
                 )
 
     def _meet(self, generation: int, is_alive: bool) -> None:
-        """Note that the token of another learner of this run stands, or has ended."""
+        """Note that the token of another learner of this run stands, or has ended; those of one group are no rivals."""
+        if generation == self._generation:
+            return
         (self._rivals.add if is_alive else self._rivals.discard)(generation)
         if not is_alive or self._joined is None:
             return

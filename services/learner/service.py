@@ -3,17 +3,15 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from threading import Event
 from typing import Final
 
-from common.comms.codec import DecodeError, decode, encode
-from common.comms.keys import KeyPartError
-from common.comms.messages import ActorReport, StageChange, Verdict
-from common.comms.transport import Request, Transport
+from common.comms.messages import StageChange
+from common.comms.transport import Transport
 from common.comms.zenoh_config import endpoint_for_others
-from common.env.robot import home_action
 from common.env.teacher import teacher_of
 from common.errors import ReportedError
 from common.policy.contract import Contract, contract_hash, contract_of, training_hash
@@ -24,24 +22,25 @@ from common.service.member import LEARNER_ID, Member
 from common.service.metrics import Metrics
 from common.service.run_folder import RunFolder
 from services.learner import checkpoint, telemetry
-from services.learner.admission import LearnerState, differs, open_rollout
+from services.learner.admission import LearnerState
 from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.divergence import NOT_FINITE
 from services.learner.generation import next_generation
-from services.learner.intake import Intake, Queued
-from services.learner.ledger import AccountSnapshot, Ledger
-from services.learner.members import IDLE_WAIT_S, Members
+from services.learner.group import ALONE, Group, GroupError
+from services.learner.intake import Queued
+from services.learner.ledger import Ledger
+from services.learner.lockstep import Lockstep
+from services.learner.members import IDLE_WAIT_S
+from services.learner.reception import Reception, in_order, lives, new_intake
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
-from services.learner.training import Training
+from services.learner.training import new_training
 
 log = logging.getLogger(__name__)
 
-ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
-REPORT_MAILBOX: Final = 256  # more than all actors of a run send at once
-SERVED_AT_ONCE: Final = 64  # messages of a kind read between two gradient steps
+TURN_WAIT_S: Final = 0.02  # pause between the turns of a group that waits for rollouts
 
 
 class RunExistsError(ReportedError):
@@ -68,13 +67,14 @@ class Clocks:
 
 
 class LearnerService:
-    """The learner of one run.
+    """The learner of one run, or the one that leads its group of learners.
 
     Args:
         config: Settings.
         transport: The hub, or a connection to one.
         metrics: Receives the service's numbers.
         clock: Returns seconds.
+        group: The learners that train together.
     """
 
     def __init__(
@@ -83,8 +83,10 @@ class LearnerService:
         transport: Transport,
         metrics: Metrics,
         clock: Callable[[], float] = time.monotonic,
+        group: Group = ALONE,
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
+        self._group = group
         endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
         self._link = f"--endpoint {endpoint}" + (
             f" --tls {config.tls}" if config.tls else ""
@@ -103,22 +105,13 @@ class LearnerService:
         self._run_log = RunLog(
             self._folder.metrics, self._folder.tensorboard, self._folder.evaluations, writers
         )
-        self._intake_config = config.intake.for_actors(config.actors)
-        self.training = Training(
-            config.ppo,
-            config.network,
-            config.curriculum,
-            home_action(task.robot),
-            config.seed,
-            notice=max(1, config.intake.lag_aimed_at),
-            observation=task.observation,
-            divergence=config.divergence,
-            teacher=teacher,
-            frames=config.frames,
-        )
+        self._dataset_rollouts = config.intake.for_actors(config.actors).dataset_rollouts
+        self._lockstep = Lockstep(group, self._dataset_rollouts)
+        self.training = new_training(config, group)
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
-        extras = self._restore() if config.resume else None
+        self._history = History(config.history, "learner-0")
+        file, extras = self._restore() if config.resume else (None, None)
         if self.training.is_distilling:
             # Raises here if the teacher does not fit: otherwise actors would end because of it, for ever restarted
             teacher_of(task, teacher)
@@ -128,21 +121,25 @@ class LearnerService:
         save_settings(self._folder.config, to_tables(config, "learner"))
         if not config.resume:
             self._run_log.truncate(0, -1)  # rows of a process that ended before its first checkpoint
-        self._intake = self._new_intake(extras)
+        if group.size > 1:  # what the others begin with
+            group.of_leader(str(self._generation).encode())
+            group.of_leader(file.read_bytes() if file else b"")
+        self._intake = new_intake(config, group, self._learner_state(), extras, self.training.obs_size)
         self._member = Member("learner", config, transport, metrics, self._generation, id=LEARNER_ID)
-        keys = self._keys = self._member.keys
-        self._rollouts = transport.serve(keys.every_rollout(), capacity=ROLLOUT_MAILBOX)
-        self._reports = transport.serve(keys.every_report(), capacity=REPORT_MAILBOX)
-        self._member.watch("rollout", self._rollouts)
-        self._member.watch("report", self._reports)
+        self._reception = Reception(
+            *(config, group, transport, self._member, metrics, self._history, self._intake),
+            self.training.obs_size,
+            clock,
+        )
+        self._members = self._reception.members
         identity = Identity(
-            config.run, self._generation, contract_hash(task, config.network), self._training_hash
+            *(config.run, self._generation, contract_hash(task, config.network), self._training_hash),
+            ranks=group.size,
         )
         self._broadcast = Broadcast(
-            transport, keys, self.training, identity, stages, config.evaluated_weights
+            transport, self._member.keys, self.training, identity, stages, config.evaluated_weights
         )
-        self._members = Members(config, transport, self._member, self._generation, self._intake, clock)
-        self._has_nothing_left = False
+        self._has_nothing_left = self._has_ended = False
         self._warned = False
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         # Without it, a learner that waits for its first actor would seem to have no checkpoint since 1970.
@@ -151,8 +148,7 @@ class LearnerService:
         self._members.join()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
-        self._history = History(config.history, "learner-0")
-        self._history.note("start", **self._where(), waiting=_lives(self._intake.waiting))
+        self._history.note("start", **self._where(), waiting=lives(self._intake.waiting))
 
     # ---- state
 
@@ -203,14 +199,19 @@ class LearnerService:
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
             self._has_nothing_left = True
+        is_whole = True  # whether the ranks of the group are all here
         try:
-            while not stop.is_set() and not self.done:
-                wait = self.step()
+            while not self._has_ended:
+                wait = self.step(stop.is_set())
                 if wait > 0:
                     self._transport.wait(wait)
             self._member.state = "done"
+        except GroupError:
+            is_whole = False  # the others' accounts can't be had: the newest checkpoint stays the last one
+            raise
         finally:
-            self.save(is_last=True)
+            if is_whole:
+                self.save(is_last=True)
             self._beat()
             self._run_log.close()
             self._member.leave()
@@ -219,26 +220,36 @@ class LearnerService:
         progress = self.training.progress
         log.info("stopped epoch=%d frames=%d stage=%d", progress.epoch, progress.frames, progress.stage)
 
-    def step(self) -> float:
-        """Answer, train an epoch if a dataset is complete, and return how long to wait [s]."""
+    def step(self, is_stopping: bool = False) -> float:
+        """Answer, train an epoch if a dataset is complete, and return how long to wait [s].
+
+        Args:
+            is_stopping: Whether a stop was requested.
+        """
         self._serve()
-        trained = False
-        dataset = self._intake.take_dataset()
-        if dataset:
-            # by number, not by arrival, so that a run with one actor is the same bit for bit on any network
-            ordered = sorted(dataset, key=lambda entry: (entry.header.actor, entry.header.sequence))
-            self._train(ordered)
-            trained = True
+        ends = is_stopping or self.done
+        dataset, is_complete, self._has_ended = self._lockstep.turn(
+            self._intake, self._clock(), ends, self._wait_for_others
+        )
+        if self._has_ended:
+            return 0.0
+        if is_complete:
+            self._train(in_order(dataset))
         now = self._clock()
-        if not trained:
+        if not is_complete:
             self._member.state = "waiting"
             self._warn_of_silence(now)
         if self._member.is_due(now):
             self._beat()
-        if trained and now >= self._clocks.next_checkpoint:
+        if is_complete and self._lockstep.agrees(now >= self._clocks.next_checkpoint):
             self._clocks.next_checkpoint = now + self._config.checkpoint_interval_s
             self.save()
-        return 0.0 if trained else IDLE_WAIT_S
+        return 0.0 if is_complete else IDLE_WAIT_S if self._group.size == 1 else TURN_WAIT_S
+
+    def _wait_for_others(self) -> None:
+        """Serve this rank's actors while the other ranks of the group are not here yet."""
+        self._serve()
+        self._transport.wait(0.001)
 
     def save(self, is_last: bool = False) -> None:
         """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
@@ -271,10 +282,8 @@ class LearnerService:
             run=self._config.run,
             generation=self._generation,
             stage_log=[asdict(change) for change in self._broadcast.stages],
-            accounts=[entry.to_json() for entry in self._intake.snapshots()],
             trained_seconds=self.seconds,
-            closed=self._intake.closed,
-            queue=tuple(encode(entry.rollout) for entry in self._intake.waiting) if is_last else (),
+            **self._lockstep.collected(self._intake, is_last),
         )
         path = checkpoint.save(self._folder.checkpoints, self.training, extras)
         if self.training.progress.is_worth_going_back_to:
@@ -282,7 +291,7 @@ class LearnerService:
         weights = self.training.weights(self._config.evaluated_weights)
         save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
-        self._history.note("saved", **self._where(), waiting=_lives(self._intake.waiting) if is_last else [])
+        self._history.note("saved", **self._where(), waiting=lives(self._intake.waiting) if is_last else [])
         log.debug("checkpoint written file=%s", path)
 
     # ---- training
@@ -300,7 +309,7 @@ class LearnerService:
         if stats.diverged:
             self._go_back(stats.diverged)
         lost = self._intake.finish_update(self._learner_state())
-        self._history.note("trained", **self._where(), rollouts=_lives(dataset), lost=_lives(lost))
+        self._history.note("trained", **self._where(), rollouts=lives(dataset), lost=lives(lost))
         self._broadcast.publish_policy()
         if stats.stage_changed:
             self._broadcast.publish_stage()
@@ -325,10 +334,13 @@ class LearnerService:
                     f"training has diverged: {reason}, and there is no good checkpoint to go back to; "
                     "try a lower --ppo.learning-rate-max"
                 )
+            self._group.of_leader(b"")
             self.training.forget_health()
             log.warning("training has diverged reason=%r; no good checkpoint yet, going on", reason)
             return
         path = good[-1]
+        if self._group.size > 1:
+            self._group.of_leader(path.read_bytes())
         self.training.go_back(lambda training: checkpoint.restore(path, training))
         self._metrics.inc("topspin_rollbacks_total")
         log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
@@ -344,19 +356,10 @@ class LearnerService:
         }
 
     def _learner_state(self) -> LearnerState:
-        progress = self.training.progress
-        return LearnerState(
-            run=self._config.run,
-            generation=self._generation,
-            version=progress.version,
-            stage_number=progress.stage_number,
-            stage=progress.stage,
-            training_hash=self._training_hash,
-            datasets_left=self.training.datasets_left,
-        )
+        return self.training.state_of(self._config.run, self._generation, self._training_hash)
 
-    def _restore(self) -> checkpoint.Extras:
-        """Load the newest whole checkpoint; return what the service keeps in it."""
+    def _restore(self) -> tuple[Path, checkpoint.Extras]:
+        """Load the newest whole checkpoint; return it, and what the service keeps in it."""
         file, extras = checkpoint.restore_newest(self._folder.checkpoints, self.training)
         self._clocks.resumed_seconds = extras.trained_seconds
         progress = self.training.progress
@@ -368,82 +371,14 @@ class LearnerService:
             self.training.progress.frames,
             len(extras.queue),
         )
-        return extras
-
-    def _new_intake(self, extras: checkpoint.Extras | None) -> Intake:
-        """Return an intake with the accounts and the waiting rollouts of a checkpoint, if there is one."""
-        learner = self._learner_state()
-        if extras is None:
-            return Intake(self._intake_config, learner)
-        limit = self._config.max_message_mib * 2**20
-        opened = [open_rollout(payload, limit, self.training.obs_size) for payload in extras.queue]
-        queue = [Queued(found[0], found[1]) for found in opened if found is not None and found[1] is not None]
-        accounts = [AccountSnapshot.from_json(values) for values in extras.accounts]
-        return Intake(self._intake_config, learner, accounts, queue, extras.closed)
+        return file, extras
 
     # ---- messages
 
     def _serve(self) -> None:
         """Answer waiting requests; also between gradient steps, so that no actor waits for an update."""
-        now = self._clock()
-        self._member.note_link(now)
-        self._members.follow()
-        for misfit in self._intake.take_new_misfits():
-            self._member.refuse(
-                "contract",
-                f"actor={misfit.actor} has training {misfit.training_hash or 'of an older release'}; allowed: "
-                f"{self._training_hash}: it gets no credits until [task], [network] and [experience] are the learner's",
-            )
-        for request in self._rollouts.waiting(SERVED_AT_ONCE):
-            self._metrics.inc("topspin_bytes_received_total", len(request.payload))
-            verdict = self._judge(request, now)
-            self._metrics.inc("topspin_rollouts_received_total", 1.0, verdict=verdict.kind.value)
-            request.reply(encode(verdict))
-        for request in self._reports.waiting(SERVED_AT_ONCE):
-            self._answer_report(request, now)
-        self._member.answer_control()
+        self._reception.serve(self._clock())
         self._broadcast.answer()
-
-    def _judge(self, request: Request, now: float) -> Verdict:
-        """Return the verdict on a request with a rollout."""
-        opened = open_rollout(request.payload, self._config.max_message_mib * 2**20, self.training.obs_size)
-        if opened is None:
-            self._member.refuse("rollout", "unreadable")
-            return self._intake.unreadable("not readable as a rollout of this release")
-        header, rollout = opened
-        if fault := self._sender_fault(request.key, header.actor):
-            self._member.refuse("rollout", fault)
-            return self._intake.unreadable(fault)
-        if header.fault:
-            self._member.refuse("rollout", f"actor={header.actor} {header.fault}")
-        verdict = self._intake.arrive(header, rollout, now)
-        self._history.note(
-            "verdict",
-            rollout=[*header.life, header.sequence],
-            kind=verdict.kind.value,
-            generation=self._generation,
-        )
-        return verdict
-
-    def _answer_report(self, request: Request, now: float) -> None:
-        try:
-            report = decode(request.payload, ActorReport)
-        except DecodeError as error:
-            self._member.refuse("report", error)
-            request.refuse()
-            return
-        if fault := self._sender_fault(request.key, report.actor):
-            self._member.refuse("report", fault)
-            request.refuse()
-            return
-        request.reply(encode(self._intake.report(report, now)))
-
-    def _sender_fault(self, key: str, actor: str) -> str:
-        """Return why a message can't be of the actor that it names, or "": the key is the sender's own."""
-        try:
-            return differs("actor", actor, self._keys.sender(key))
-        except KeyPartError as error:
-            return str(error)
 
     def _warn_of_silence(self, now: float) -> None:
         since = max(self._clocks.last_trained, self._clocks.born)
@@ -461,8 +396,8 @@ class LearnerService:
         else:
             log.warning(
                 "waiting for=rollouts have=%d of=%d actors=%d with_another_contract=%d",
-                self._intake.queued,
-                self._intake_config.dataset_rollouts,
+                self._lockstep.queued,
+                self._dataset_rollouts,
                 actors,
                 len(self._intake.misfits),
             )
@@ -484,19 +419,15 @@ class LearnerService:
 
     def _beat(self) -> None:
         self._intake.tidy(self._clock())
-        ledger, queued = self.ledger(), self._intake.queued
+        ledger = self.ledger()
         telemetry.measure_state(self._metrics, ledger, self._intake, self._members.roles)
+        is_alone = self._group.size == 1  # a group's sums are those of its last turn
         counters, gauges = telemetry.heartbeat(
             self.training.progress,
             self._config.curriculum.epochs or 0,
             self.seconds,
-            ledger,
-            queued,
+            telemetry.fates(ledger) if is_alone else self._lockstep.fates,
+            self._intake.queued if is_alone else self._lockstep.queued,
             self._last | {"misfits": len(self._intake.misfits)},
         )
         self._member.beat(counters, gauges)
-
-
-def _lives(entries: Iterable[Queued]) -> list[tuple[str, int, int]]:
-    """Return the name of each rollout in a history: actor, incarnation, number."""
-    return [(*entry.header.life, entry.header.sequence) for entry in entries]

@@ -84,16 +84,13 @@ def measure_epoch(metrics: Metrics, stats: EpochStats, frames_per_s: float, upda
         metrics.set("topspin_reward_per_frame", float(term), term=name)
 
 
+FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")
+
+
 def fates(ledger: Ledger) -> dict[str, int]:
     """Return the ledger's counts by fate."""
-    return {
-        "published": ledger.published,
-        "trained": ledger.trained,
-        "refused": sum(ledger.refused.values()),
-        "dropped": ledger.dropped,
-        "in_flight": ledger.in_flight,
-        "lost": ledger.lost,
-    }
+    counts: dict[str, int] = {name: getattr(ledger, name) for name in FATES if name != "refused"}
+    return {name: sum(ledger.refused.values()) if name == "refused" else counts[name] for name in FATES}
 
 
 def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Iterable[str]) -> None:
@@ -109,7 +106,12 @@ def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Itera
 
 
 def heartbeat(
-    progress: Progress, epochs: int, seconds: float, ledger: Ledger, queued: int, last: Mapping[str, float]
+    progress: Progress,
+    epochs: int,
+    seconds: float,
+    counts: Mapping[str, int],
+    queued: int,
+    last: Mapping[str, float],
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Return counters and gauges of the learner's heartbeat.
 
@@ -117,11 +119,11 @@ def heartbeat(
         progress: Of training.
         epochs: Of the whole curriculum; 0: its stages are shares of the frames.
         seconds: Training time, through restarts [s].
-        ledger: Of all actors.
+        counts: The ledger of all actors, by fate.
         queued: Rollouts that wait for an update.
         last: ``epoch_gauges`` of the newest epoch.
     """
-    counters = {"frames": float(progress.frames)} | {k: float(v) for k, v in fates(ledger).items()}
+    counters = {"frames": float(progress.frames)} | {k: float(v) for k, v in counts.items()}
     gauges = {
         "epoch": progress.epoch,
         "epochs": epochs,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import Rollout
+from common.env.robot import home_action
 from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
 from common.policy.network_pass import NetworkPass
@@ -17,7 +18,14 @@ from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import TeacherConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
-from services.learner.config import CurriculumConfig, DivergenceConfig, EvaluatedWeights, PPOConfig
+from services.learner.admission import LearnerState
+from services.learner.config import (
+    CurriculumConfig,
+    DivergenceConfig,
+    EvaluatedWeights,
+    LearnerConfig,
+    PPOConfig,
+)
 from services.learner.curriculum import StageLengths, Trained, decayed
 from services.learner.dataset import Batch, Distillation, Model, read
 from services.learner.divergence import Health, divergence, running_mean, watched
@@ -105,6 +113,19 @@ class Training:
     def is_finite(self) -> bool:
         """Whether every parameter is finite."""
         return all(bool(parameter.isfinite().all()) for parameter in self.network.parameters())
+
+    def state_of(self, run: str, generation: int, training_hash: str) -> LearnerState:
+        """Return what verdicts on rollouts depend on."""
+        progress = self.progress
+        return LearnerState(
+            run=run,
+            generation=generation,
+            version=progress.version,
+            stage_number=progress.stage_number,
+            stage=progress.stage,
+            training_hash=training_hash,
+            datasets_left=self.datasets_left,
+        )
 
     def run_epoch(
         self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None
@@ -258,3 +279,21 @@ class Training:
             refitting=is_other_stage or then.refitting,
             refitting_since=now.epochs_in_stage,
         )
+
+
+def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
+    """Return the training of a run at its start, of one rank of a group."""
+    training = Training(
+        config.ppo,
+        config.network,
+        config.curriculum,
+        home_action(config.task.robot),
+        config.seed,
+        notice=max(1, config.intake.lag_aimed_at),
+        observation=config.task.observation,
+        divergence=config.divergence,
+        teacher=config.experience.teacher,
+        frames=config.frames,
+    )
+    training.group = group
+    return training

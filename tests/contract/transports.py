@@ -9,7 +9,7 @@ from common.comms.transport import Flow, Reply, Request, Server, Transport
 from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 
-RUN = "topspin/v2/contract"
+RUN = "topspin/v3/contract"
 LIMIT = 1024 * 1024
 
 

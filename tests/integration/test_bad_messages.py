@@ -108,7 +108,7 @@ def test_the_learner_refuses_each_bad_rollout_with_its_reason_and_trains_on(tmp_
         after = learner.scrape()
         refusal = client.send(b"nonsense", KEYS.ctl("learner", "0"))
         forged = client.send(encode(dataclasses.replace(REPORT, actor="other")), KEYS.report("client"))
-        token = client.transport.declare_alive("topspin/v2/test/alive/actor/x/²")
+        token = client.transport.declare_alive("topspin/v3/test/alive/actor/x/²")
         wait_until(
             lambda: learner.metric("topspin_messages_refused_total", kind="alive") == 1,
             5,

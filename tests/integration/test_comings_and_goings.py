@@ -299,7 +299,7 @@ def test_a_generator_idles_without_subscribers(tmp_path):
             "idleness",
         )
         silent = generator.scrape()["topspin_rallies_published_total"]
-        subscription = s.peer().subscribe("topspin/v2/test/rally/1", capacity=8)
+        subscription = s.peer().subscribe("topspin/v3/test/rally/1", capacity=8)
         assert subscription.wait(10.0)
         wait_until(lambda: generator.metric("topspin_rallies_published_total") >= 32, 10, "its first batch")
         subscription.close()

@@ -37,7 +37,7 @@ def markdown() -> str:
         "## Roles",
         "",
         "With TLS the hub drops whatever is not in this table ([Security](../security.md)). `ID` is the id in the",
-        "certificate's name. All keys follow `topspin/v2/<run>/`.",
+        "certificate's name. All keys follow `topspin/v3/<run>/`.",
         "",
         *_roles(),
         "",

@@ -2,7 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.comms.keys import KeyPartError, Keys, Member, matches
+from common.comms.keys import KeyPartError, Keys, Member, matches, rank_of
 
 KEYS = Keys("night-1")
 
@@ -10,18 +10,27 @@ KEYS = Keys("night-1")
 @pytest.mark.parametrize(
     ("key", "text"),
     [
-        (KEYS.policy(), "topspin/v2/night-1/policy"),
-        (KEYS.stage(), "topspin/v2/night-1/stage"),
-        (KEYS.rollout("0"), "topspin/v2/night-1/rollout/0"),
-        (KEYS.report("lab-1"), "topspin/v2/night-1/report/lab-1"),
-        (KEYS.rally(3), "topspin/v2/night-1/rally/3"),
-        (KEYS.ctl("actor", "a-0"), "topspin/v2/night-1/ctl/actor/a-0"),
-        (KEYS.alive("actor", "a-0", 12), "topspin/v2/night-1/alive/actor/a-0/12"),
-        (KEYS.status("learner", "l"), "topspin/v2/night-1/status/learner/l"),
+        (KEYS.policy(), "topspin/v3/night-1/policy"),
+        (KEYS.stage(), "topspin/v3/night-1/stage"),
+        (KEYS.rollout("0"), "topspin/v3/night-1/rollout/0/0"),
+        (KEYS.rollout("7", rank=3), "topspin/v3/night-1/rollout/3/7"),
+        (KEYS.report("lab-1"), "topspin/v3/night-1/report/0/lab-1"),
+        (KEYS.report("lab-1", rank=1), "topspin/v3/night-1/report/1/lab-1"),
+        (KEYS.rally(3), "topspin/v3/night-1/rally/3"),
+        (KEYS.ctl("actor", "a-0"), "topspin/v3/night-1/ctl/actor/a-0"),
+        (KEYS.alive("actor", "a-0", 12), "topspin/v3/night-1/alive/actor/a-0/12"),
+        (KEYS.status("learner", "l"), "topspin/v3/night-1/status/learner/l"),
     ],
 )
 def test_keys_are_as_documented(key, text):
     assert key == text
+
+
+def test_actors_that_are_numbered_are_divided_evenly_among_the_learners():
+    assert [rank_of(str(number), 3) for number in range(7)] == [0, 1, 2, 0, 1, 2, 0]
+    assert [rank_of(f"topspin-actor-{number}", 2) for number in (0, 1, 10, 11)] == [0, 1, 0, 1]
+    assert {rank_of(name, 4) for name in ("lab", "7", "x-3", "desk-of-a-person")} <= set(range(4))
+    assert rank_of("anything", 1) == 0
 
 
 @pytest.mark.parametrize("run", ["", "a/b", "*", "a*", "a?", "a#", "$a", "@a", "ä", "a b", ".a", "x" * 65])
@@ -49,10 +58,10 @@ def test_a_liveliness_key_names_its_member(role, id_, incarnation):
 
 
 @pytest.mark.parametrize(
-    "key", ["", "topspin/v2/other/alive/actor/a/1", KEYS.policy(), f"{KEYS.alive('actor', 'a', 1)}/x"]
+    "key", ["", "topspin/v3/other/alive/actor/a/1", KEYS.policy(), f"{KEYS.alive('actor', 'a', 1)}/x"]
 )
 def test_a_key_that_is_not_a_liveliness_key_is_refused(key):
-    with pytest.raises(KeyPartError, match="is not topspin/v2/night-1/alive/"):
+    with pytest.raises(KeyPartError, match="is not topspin/v3/night-1/alive/"):
         KEYS.member(key)
 
 

@@ -9,9 +9,9 @@ from common.comms.roles import OPERATOR, ROLES, access_control, rights_of
 KEYS = Keys("r")
 
 
-def who(verb, key):
-    """Return the roles that may do this, each with the id 3."""
-    rights = {role: getattr(rights_of(f"{role}-3", KEYS), verb) for role in ROLES}
+def who(verb, key, id_="3"):
+    """Return the roles that may do this, each with this id."""
+    rights = {role: getattr(rights_of(f"{role}-{id_}", KEYS), verb) for role in ROLES}
     return {role for role, expressions in rights.items() if any(matches(e, key) for e in expressions)}
 
 
@@ -22,17 +22,16 @@ def test_every_service_has_a_role_and_there_is_an_operator():
 @pytest.mark.parametrize(
     ("verb", "key", "roles"),
     [
-        ("publish", KEYS.policy(), {"learner"}),
-        ("answer", KEYS.policy(), {"learner"}),
-        ("publish", KEYS.stage(), {"learner"}),
         ("publish", KEYS.rally(7), {"generator"}),
         ("answer", KEYS.rally(7), {"generator"}),
         ("ask", KEYS.rollout("3"), {"actor"}),
         ("ask", KEYS.rollout("4"), set()),
         ("ask", KEYS.report("3"), {"actor"}),
         ("ask", KEYS.report("4"), set()),
-        ("answer", KEYS.rollout("3"), {"learner"}),
-        ("answer", KEYS.report("3"), {"learner"}),
+        ("ask", KEYS.rollout("3", rank=2), {"actor"}),
+        ("answer", KEYS.rollout("8", rank=3), {"learner"}),
+        ("answer", KEYS.rollout("8", rank=0), set()),
+        ("answer", KEYS.report("8", rank=3), {"learner"}),
         ("publish", KEYS.status("actor", "3"), {"actor"}),
         ("publish", KEYS.status("actor", "4"), set()),
         ("publish", KEYS.status("learner", "3"), {"learner"}),
@@ -49,6 +48,13 @@ def test_every_service_has_a_role_and_there_is_an_operator():
 )
 def test_only_these_roles_may(verb, key, roles):
     assert who(verb, key) == roles
+
+
+@pytest.mark.parametrize("verb", ["publish", "answer"])
+@pytest.mark.parametrize("key", [KEYS.policy(), KEYS.stage()])
+def test_of_a_group_of_learners_only_the_first_says_what_is_played(verb, key):
+    assert who(verb, key, "0") == {"learner"}
+    assert who(verb, key, "3") == set()
 
 
 def test_a_name_without_a_role_is_refused():

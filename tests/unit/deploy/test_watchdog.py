@@ -7,6 +7,7 @@ import time
 import pytest
 
 from deploy.watchdog import LOOK_S, MOST_LIMITS, Pulse, Watchdog, cpu_seconds, hung, is_hung, wants_a_core
+from tests.waiting import wait_until
 
 LIMIT = 60.0
 
@@ -95,3 +96,14 @@ def test_a_stopped_process_is_told_from_a_busy_one():
     assert found == ["stopped"]
     assert wanting == (True, False)
     assert cpu_seconds(2**30) is None
+
+
+def test_the_work_of_a_process_is_that_of_its_children_too():
+    burns = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'while True: pass'], check=False)"
+    process = subprocess.Popen([sys.executable, "-c", burns], start_new_session=True)
+    try:
+        wait_until(lambda: (cpu_seconds(process.pid) or 0.0) > 0.5, 30, "the child's work to count")
+        assert wants_a_core(process.pid)
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()

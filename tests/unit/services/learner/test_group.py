@@ -25,14 +25,20 @@ CURRICULUM = CurriculumConfig(first_stage=1, stage_1=1, stage_2=0, stage_3=50)
 
 
 def trained(group: Group, ppo: PPOConfig) -> Training:
-    """Return a training after three epochs, of which this rank has had its share of the rollouts."""
+    """Return a training after three epochs, of which this rank has had its share of the rollouts.
+
+    The first rank has all of the second dataset.
+    """
     training = make_training(ppo=ppo, curriculum=CURRICULUM)
     training.group = group
     each = ROLLOUTS // group.size
     for epoch in range(EPOCHS):
         # Rollouts of different sizes: a rank's share is not a fixed part of the dataset
         rollouts = [make_rollout(seed=10 * epoch + k, envs=8 + 4 * k) for k in range(ROLLOUTS)]
-        training.run_epoch(rollouts[each * group.rank : each * (group.rank + 1)])
+        mine = rollouts[each * group.rank : each * (group.rank + 1)]
+        if epoch == 1:
+            mine = [] if group.rank else rollouts
+        training.run_epoch(mine)
     return training
 
 
@@ -50,12 +56,23 @@ def outcome(training: Training) -> dict[str, np.ndarray]:
     }
 
 
+def exchanged(group: Group) -> None:
+    """Check what every rank gets of the others."""
+    counts = group.gathered(np.arange(group.rank))
+    assert [len(row) for row in counts] == list(range(group.size))
+    texts = [b"", bytes(range(256)), b"x" * group.rank][: group.rank + 1]
+    assert group.gathered_bytes(texts)[-1] == [b"", bytes(range(256)), b"x" * (group.size - 1)][: group.size]
+    assert group.gathered_bytes([])[0] == []
+    assert group.of_leader(b"of the leader" if group.leads else b"of another") == b"of the leader"
+
+
 def rank_main(rank: int, size: int, port: int, ppo: PPOConfig, results: Connection) -> None:
     environment = {"RANK": str(rank), "WORLD_SIZE": str(size)}
     import os
 
     os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
     group = join(environment)
+    exchanged(group)
     results.send(outcome(trained(group, ppo)))
     group.leave()
 
