@@ -52,15 +52,16 @@ class Role:
         """Return module and flags of one process, as after ``python -m``.
 
         Args:
-            index: Its number, from 0, or what a manager of processes replaces by it.
+            index: Its number, from 0, or what a manager of processes replaces by it; "": the learner gives it one.
             file: The run's settings.
             port: Of its /metrics.
             more: Flags that follow.
         """
-        which = ("--index", index) if self.has_index else ()
+        name = ("--id", index) if index else ()
+        which = ("--index", index) if self.has_index and index else ()
         return (
             f"services.{self.name}",
-            *("--config", file, "--id", index, "--metrics-port", port),
+            *("--config", file, *name, "--metrics-port", port),
             *which,
             *more,
         )

@@ -34,6 +34,8 @@ BUDGETS: Final[Mapping[str, Budget]] = MappingProxyType(
         "StageLog": CONTROL,
         "Verdict": CONTROL,
         "ActorReport": CONTROL,
+        "JoinRequest": CONTROL,
+        "Place": CONTROL,
         "Status": CONTROL,
         "Control": CONTROL,
         "ControlReply": CONTROL,

@@ -7,6 +7,7 @@ topspin/v3/<run>/rollout/<rank>/<actor>          rollouts of one actor: requests
                                                  verdict
 topspin/v3/<run>/report/<rank>/<actor>           reports of one actor: requests to its learner; the reply is a
                                                  verdict with new credits
+topspin/v3/<run>/join                            requests of actors that have no number yet; the reply is a place
 topspin/v3/<run>/rally/<shard>                   valid rallies: put in batches, or requested by index
 topspin/v3/<run>/ctl/<role>/<id>                 commands to one service
 topspin/v3/<run>/alive/<role>/<id>/<incarnation> liveliness tokens
@@ -62,6 +63,10 @@ class Keys:
     def stage(self) -> str:
         """Return the key of stage changes."""
         return f"{PREFIX}/{self.run}/stage"
+
+    def join(self) -> str:
+        """Return the key on which an actor asks for its number and its settings."""
+        return f"{PREFIX}/{self.run}/join"
 
     def rollout(self, actor: str, rank: int = 0) -> str:
         """Return the key for the rollouts of one actor to a learner of this rank."""

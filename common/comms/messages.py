@@ -283,6 +283,28 @@ class ActorReport:
 
 
 @dataclass(frozen=True, slots=True)
+class JoinRequest:
+    """A request of an actor that has no number yet. The reply is a `Place`."""
+
+    VERSION: ClassVar[int] = 1
+
+    actor: Annotated[
+        str, Wire(text=f"|{ID_PATTERN}")
+    ]  # its name, such as its certificate's; "": it has none yet
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What an actor needs to join a run."""
+
+    VERSION: ClassVar[int] = 1
+
+    actor: Id
+    index: Count  # its number: it decides the action noise and the shard of rallies
+    settings: bytes  # TOML: what must be as the learner has it
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """A heartbeat. Its counters are cumulative, so a lost heartbeat loses no information."""
 
@@ -333,6 +355,8 @@ MESSAGES: tuple[type[Any], ...] = (
     Rollout,
     Verdict,
     ActorReport,
+    JoinRequest,
+    Place,
     Status,
     Control,
     ControlReply,

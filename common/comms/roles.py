@@ -37,7 +37,7 @@ def _rank(learner: str) -> int:
 
 def _led(keys: Keys, learner: str) -> tuple[str, ...]:
     """Return the keys of what only the leading learner says."""
-    return () if _rank(learner) else (keys.policy(), keys.stage())
+    return () if _rank(learner) else (keys.policy(), keys.stage(), keys.join())
 
 
 ROLES: Final[Mapping[str, Callable[[Keys, str], Rights]]] = MappingProxyType(
@@ -54,7 +54,13 @@ ROLES: Final[Mapping[str, Callable[[Keys, str], Rights]]] = MappingProxyType(
         "actor": lambda keys, id_: Rights(
             publish=(keys.status("actor", id_),),
             subscribe=(keys.policy(), keys.stage(), keys.every_rally()),
-            ask=(keys.rollouts_to_any(id_), keys.reports_to_any(id_), keys.policy(), keys.every_rally()),
+            ask=(
+                keys.rollouts_to_any(id_),
+                keys.reports_to_any(id_),
+                keys.policy(),
+                keys.join(),
+                keys.every_rally(),
+            ),
             answer=(keys.ctl("actor", id_),),
             show=(keys.every_life_of("actor", id_),),
             watch=(keys.every_life_of("learner", "0"),),

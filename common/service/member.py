@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 LEARNER_ID: Final = "0"  # of the learner that keeps the run; others of its group are 1, 2, ...
 REFUSED_KINDS: Final = MappingProxyType(
     {
-        "learner": ("control", "alive", "contract", "report", "rollout"),
+        "learner": ("control", "alive", "contract", "join", "report", "rollout"),
         "actor": ("control", "alive", "policy", "rally", "stage", "verdict"),
         "generator": ("control", "request"),
         "evaluator": ("control", "policy"),

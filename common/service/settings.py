@@ -2,7 +2,9 @@
 
 import os
 import time
-from typing import Final, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -10,6 +12,17 @@ from common.comms.zenoh_config import LinkConfig, ZenohConfig
 from common.service.endpoint import FIRST_PORT
 
 MOST_ACTORS: Final = 1000
+FROM_LEARNER: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "": ("seed", "actors", "generators", "shards", "lease_s", "max_message_mib"),
+        "task": (),
+        "network": (),
+        "experience": (),
+        "actor": ("envs", "horizon", "rallies"),
+    }
+)
+"""Settings that a learner gives to actors that join: by table ("": none), and of which table all (). No other counts:
+on an open hub a stranger may answer, and must not say where files are written or where the actor connects."""
 LogLevel = Literal["debug", "info", "warning", "error"]
 
 
@@ -63,3 +76,14 @@ class Fleet(BaseModel):
 def new_incarnation() -> int:
     """Return a number that is larger in every later life of a service: milliseconds since 1970, then the process id."""
     return int(time.time() * 1000) * 2**10 + os.getpid() % 2**10
+
+
+def from_learner(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """Return of a run's settings those that a learner gives to actors that join."""
+    found: dict[str, Any] = {name: tables[name] for name in FROM_LEARNER[""] if name in tables}
+    for table, names in FROM_LEARNER.items():
+        values = tables.get(table)
+        if isinstance(values, dict):
+            some = {name: value for name, value in values.items() if not names or name in names}
+            found |= {table: some} if some else {}
+    return found

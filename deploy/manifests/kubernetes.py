@@ -1,7 +1,7 @@
 """Kubernetes: a kustomize base of an open run in its own namespace, and an overlay with TLS.
 
-Every role is a StatefulSet. The number of a pod is the service's id and index, and names its certificate; pods of a
-Deployment have none. Actors and generators start and stop in parallel and keep no files.
+Actors are one Deployment: the learner gives each its number. The other roles are StatefulSets. The number of a pod is
+the service's id and index. With TLS it names the certificate, so there the actors are a StatefulSet too.
 """
 
 from typing import Any, Final
@@ -24,6 +24,7 @@ from deploy.manifests.site import (
     settings,
 )
 from deploy.topology import ROLES, Resources, Role
+from deploy.topology import role as role_named
 
 NAMESPACE: Final = "topspin"
 HUB: Final = "hub"  # the service that all connect to: the router's, or with TLS the learner's
@@ -34,6 +35,8 @@ _NUMBER: Final = "apps.kubernetes.io/pod-index"
 _START_S: Final = 300  # a pod on a kind of CPU that the image was not built on compiles its kernels first
 _LEARNER_DISK: Final = "20Gi"
 _EVALUATOR_DISK: Final = "1Gi"
+_CERTIFICATES: Final = {"name": "tls", "mountPath": CERTIFICATES, "readOnly": True}
+ACTOR: Final = role_named("actor")
 
 
 def labels(role: str) -> dict[str, str]:
@@ -68,20 +71,25 @@ def base() -> dict[str, list[dict[str, Any]] | dict[str, Any] | str]:
 
 def tls() -> dict[str, list[dict[str, Any]] | dict[str, Any] | str]:
     """Return the files of the overlay with TLS: the learner is the hub, since the hub applies the roles' rules."""
-    mounts = {role.name: _certificates_patch(role) for role in ROLES}
+    mounts = {role.name: _certificates_patch(role) for role in ROLES if role.name != "actor"}
     return {
         "config.toml": settings(f"tls/{HUB}:{LINK_PORT}", tls=True),
         **{f"{name}.yaml": patch for name, patch in mounts.items()},
         "hub.yaml": _service(HUB, "learner", LINK_PORT),
+        "actor.yaml": _numbered_actors(),
+        "no-actors.yaml": {"$patch": "delete", **_head("apps/v1", "Deployment", "actor")},
+        "autoscaler.yaml": _head("autoscaling/v2", "HorizontalPodAutoscaler", "actor")
+        | {"spec": {"scaleTargetRef": _scaled("StatefulSet")}},
         "no-router.yaml": {"$patch": "delete", **_head("apps/v1", "Deployment", "router")},
         "no-router-budget.yaml": {"$patch": "delete", **_head("policy/v1", "PodDisruptionBudget", "router")},
         "kustomization.yaml": {
             "apiVersion": "kustomize.config.k8s.io/v1beta1",
             "kind": "Kustomization",
             "namespace": NAMESPACE,
-            "resources": ["../base"],
+            "resources": ["../base", "actor.yaml"],
             "patches": [
-                {"path": f"{name}.yaml"} for name in ("hub", "no-router", "no-router-budget", *mounts)
+                {"path": f"{name}.yaml"}
+                for name in ("hub", "no-router", "no-router-budget", "no-actors", "autoscaler", *mounts)
             ],
             "configMapGenerator": [{"name": "settings", "behavior": "replace", "files": ["config.toml"]}],
         },
@@ -185,23 +193,46 @@ def _router() -> dict[str, Any]:
 
 
 def _workload(role: Role) -> list[dict[str, Any]]:
-    container = _container(command(role, INDEX), role.resources)
+    if role.name == "actor":
+        return [_actors()]
+    spec = _numbered(role)
+    spec = {"replicas": role.count(SITE), **spec}
+    return [
+        _head("apps/v1", "StatefulSet", role.name, labels=labels(role.name)) | {"spec": spec},
+        _headless(role),
+    ]
+
+
+def _role_pod(role: Role, index: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the pod of a role, and its container."""
+    container = _container(command(role, index), role.resources)
+    container["volumeMounts"].append({"name": "settings", "mountPath": "/etc/topspin", "readOnly": True})
+    volumes = [{"name": "settings", "configMap": {"name": "settings"}}]
+    return _pod(role.name, container, role.grace_s, volumes), container
+
+
+def _actors() -> dict[str, Any]:
+    """Return the actors; the autoscaler sets how many there are."""
+    pod, _ = _role_pod(ACTOR, index="")
+    return _head("apps/v1", "Deployment", "actor", labels=labels("actor")) | {
+        "spec": {"selector": {"matchLabels": labels("actor")}, "template": pod}
+    }
+
+
+def _numbered(role: Role) -> dict[str, Any]:
+    """Return the specification of a StatefulSet, whose pods have numbers."""
+    pod, container = _role_pod(role, INDEX)
     container["env"] = [
         {"name": "POD_INDEX", "valueFrom": {"fieldRef": {"fieldPath": f"metadata.labels['{_NUMBER}']"}}}
     ]
-    container["volumeMounts"].append({"name": "settings", "mountPath": "/etc/topspin", "readOnly": True})
     if role.name == "learner":
         container["ports"].append({"name": "link", "containerPort": LINK_PORT})
     spec: dict[str, Any] = {
         "serviceName": role.name,
         "podManagementPolicy": "Parallel",
         "selector": {"matchLabels": labels(role.name)},
-        "template": _pod(
-            role.name, container, role.grace_s, [{"name": "settings", "configMap": {"name": "settings"}}]
-        ),
+        "template": pod,
     }
-    if role.name != "actor":  # the autoscaler sets the number of actors
-        spec = {"replicas": role.count(SITE), **spec}
     if role.keeps_files:
         disk = _LEARNER_DISK if role.name == "learner" else _EVALUATOR_DISK
         container["volumeMounts"].append({"name": "work", "mountPath": WORK})
@@ -211,22 +242,36 @@ def _workload(role: Role) -> list[dict[str, Any]]:
                 "spec": {"accessModes": ["ReadWriteOnce"], "resources": {"requests": {"storage": disk}}},
             }
         ]
-    workload = _head("apps/v1", "StatefulSet", role.name, labels=labels(role.name)) | {"spec": spec}
-    return [workload, _headless(role)]
+    return spec
+
+
+def _numbered_actors() -> list[dict[str, Any]]:
+    """Return the actors of a run with TLS: the number of a pod names its certificate."""
+    spec = _numbered(ACTOR)
+    (container,) = spec["template"]["spec"]["containers"]
+    container["volumeMounts"].append(_CERTIFICATES)
+    spec["template"]["spec"]["volumes"].append(_secret(ACTOR))
+    return [
+        _head("apps/v1", "StatefulSet", "actor", labels=labels("actor")) | {"spec": spec},
+        _headless(ACTOR),
+    ]
 
 
 def _certificates_patch(role: Role) -> dict[str, Any]:
     """Return the patch that mounts a role's certificates; with them the learner listens itself."""
     container: dict[str, Any] = {
         "name": "topspin",
-        "volumeMounts": [{"name": "tls", "mountPath": CERTIFICATES, "readOnly": True}],
+        "volumeMounts": [_CERTIFICATES],
     }
     if role.name == "learner":
         arguments = command(role, INDEX, is_hub=True)
         container["args"] = [*arguments, "--endpoint", f"tls/0.0.0.0:{LINK_PORT}"]
-    secret = {"name": "tls", "secret": {"secretName": f"tls-{role.name}", "defaultMode": 0o440}}
-    pod = {"spec": {"containers": [container], "volumes": [secret]}}
+    pod = {"spec": {"containers": [container], "volumes": [_secret(role)]}}
     return _head("apps/v1", "StatefulSet", role.name) | {"spec": {"template": pod}}
+
+
+def _secret(role: Role) -> dict[str, Any]:
+    return {"name": "tls", "secret": {"secretName": f"tls-{role.name}", "defaultMode": 0o440}}
 
 
 def _keep_one(role: str) -> dict[str, Any]:
@@ -235,11 +280,15 @@ def _keep_one(role: str) -> dict[str, Any]:
     }
 
 
+def _scaled(kind: str) -> dict[str, str]:
+    return {"apiVersion": "apps/v1", "kind": kind, "name": "actor"}
+
+
 def _autoscaler() -> dict[str, Any]:
     """Return the rule that adds actors while the learner waits for data, and takes them away again."""
     return _head("autoscaling/v2", "HorizontalPodAutoscaler", "actor") | {
         "spec": {
-            "scaleTargetRef": {"apiVersion": "apps/v1", "kind": "StatefulSet", "name": "actor"},
+            "scaleTargetRef": _scaled("Deployment"),
             "minReplicas": SITE.fewest_actors,
             "maxReplicas": SITE.actors,  # actors beyond the setting would get no environments of their own
             "metrics": [

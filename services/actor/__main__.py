@@ -17,8 +17,11 @@ def main(stop: Event) -> int:
     """Run the service until it is done or asked to stop; return the exit status."""
     config = load(ActorConfig, sys.argv[1:], prog=PROG, section="actor")
     from common.service.connection import connected
+    from services.actor.joining import joined
     from services.actor.service import ActorService
 
+    if config.index < 0:
+        config = joined(config, sys.argv[1:], PROG, stop)
     with connected("actor", config, stop) as (transport, metrics):
         ActorService(config, transport, metrics, new_incarnation()).run(stop)
     return DONE

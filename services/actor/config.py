@@ -69,7 +69,8 @@ class ActorOptions(BaseModel):
 class ActorConfig(ServiceConfig, Fleet, ActorOptions):
     """Play rallies with the newest policy and send the rollouts to the learner.
 
-    [task], [network] and [experience] must be the learner's, otherwise the actor refuses its policies.
+    With --run and --endpoint alone the learner says what else there is to know. [task], [network] and [experience] must
+    be the learner's, otherwise the actor refuses its policies.
     """
 
     often: ClassVar = {
@@ -78,14 +79,20 @@ class ActorConfig(ServiceConfig, Fleet, ActorOptions):
     }
 
     index: int = Field(
-        0,
-        ge=0,
+        -1,
+        ge=-1,
         exclude=True,
-        description="number of this actor, from 0; decides its action noise and its rally shard",
+        description="number of this actor, from 0; decides its action noise and its rally shard. -1: the learner gives "
+        "it, and with it the id and the settings that are not given here",
     )
     task: TaskConfig = TaskConfig()
     network: NetworkConfig = NetworkConfig()
     experience: ExperienceConfig = ExperienceConfig()
+
+    @property
+    def number(self) -> int:
+        """The number of this actor, from 0."""
+        return max(self.index, 0)
 
     @property
     def env_count(self) -> int:

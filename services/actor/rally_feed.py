@@ -51,7 +51,7 @@ class RallyFeed:
     ) -> None:
         self._config, self._transport, self._member = config, transport, member
         self._is_stopping = is_stopping
-        self.shard = config.index % config.shard_count
+        self.shard = config.number % config.shard_count
         self._key = member.keys.rally(self.shard)
         self._rallies: Subscription | None = None
         if config.rallies == "subscribe":

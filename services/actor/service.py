@@ -59,7 +59,7 @@ class ActorService:
         self._keys = keys = self._member.keys
         self._stop = Event()
         self._feed = RallyFeed(config, transport, self._member, self._is_stopping)
-        seed = int(bits(config.seed, Stream.RESET, config.index)) >> 1
+        seed = int(bits(config.seed, Stream.RESET, config.number)) >> 1
         envs = config.env_count
         self._buffer = RallyBuffer(envs, config.task, seed, self._refill)
         self._player = Player(

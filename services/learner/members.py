@@ -60,6 +60,11 @@ class Members:
         """The role of each service that lives, without the learner's."""
         return [role for role, _, _ in self._alive]
 
+    @property
+    def actors(self) -> set[str]:
+        """The names of the actors that live."""
+        return {id_ for role, id_, _ in self._alive if role == "actor"}
+
     def join(self) -> None:
         """Wait for the end of an earlier learner, whose token may stand for a moment after its death, then join.
 

@@ -33,6 +33,7 @@ from services.learner.intake import Queued
 from services.learner.ledger import Ledger
 from services.learner.lockstep import Lockstep
 from services.learner.members import IDLE_WAIT_S
+from services.learner.places import Registrar
 from services.learner.reception import Reception, in_order, lives, new_intake
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
@@ -139,6 +140,7 @@ class LearnerService:
         self._broadcast = Broadcast(
             transport, self._member.keys, self.training, identity, stages, config.evaluated_weights
         )
+        self._registrar = Registrar(config, self._folder.config, transport, self._member)
         self._has_nothing_left = self._has_ended = False
         self._warned = False
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
@@ -377,8 +379,10 @@ class LearnerService:
 
     def _serve(self) -> None:
         """Answer waiting requests; also between gradient steps, so that no actor waits for an update."""
-        self._reception.serve(self._clock())
+        now = self._clock()
+        self._reception.serve(now)
         self._broadcast.answer()
+        self._registrar.answer(self._members.actors, now)
 
     def _warn_of_silence(self, now: float) -> None:
         since = max(self._clocks.last_trained, self._clocks.born)

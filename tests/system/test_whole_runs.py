@@ -136,7 +136,8 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
     learner = (*learner, "--ppo.minibatch", 256, "--checkpoint-interval-s", 0.2)
     with (
         running(tmp_path, "services.generator", *common),
-        running(tmp_path, "services.actor", *common, *network, "--envs", 32, "--horizon", 16) as actor,
+        # It gets its number, and the network, from the learner
+        running(tmp_path, "services.actor", *common[:4], "--envs", 32, "--horizon", 16) as actor,
     ):
         with running(tmp_path, "services.learner", *learner) as first:
             wait_until(lambda: len(rows(tmp_path)) >= 20, 90, "training")
@@ -161,6 +162,7 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
     assert (recorded["frames"], recorded["seed"], recorded["run"]) == (frames + 30_000, 1, "r")
     assert actor_status == 0, actor_err
     assert "Traceback" not in actor_err
+    assert "place given actor=0 index=0" in first.err.read_text()
     assert len(set(re.findall(r"policy received generation=(\d+)", actor_err))) == 2
     epochs = [int(row["epoch"]) for row in rows(tmp_path)]
     assert epochs == list(range(1, len(epochs) + 1))  # epochs after the last checkpoint are trained again
