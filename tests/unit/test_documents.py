@@ -149,3 +149,14 @@ def test_the_example_of_a_settings_file_says_what_differs_from_the_defaults():
     text = printed(dispatch, ["train", "--config", str(file), "--print-config"], Event())
 
     assert tomllib.loads(text) == tomllib.loads(file.read_text())
+
+
+def test_a_message_that_the_pages_explain_is_one_that_a_program_says():
+    folders = ("common", "services", "deploy", "topspin")
+    text = "\n".join(file.read_text() for folder in folders for file in (ROOT / folder).rglob("*.py"))
+    said = re.sub(r'"\s*\n\s*f?"', "", text)  # a long text is written in several pieces
+    rows = [line for line in (ROOT / "docs/troubleshooting.md").read_text().splitlines() if line[:2] == "| "]
+    messages = [message for row in rows for message in re.findall(r"`([^`]+)`", row.split("|")[1])]
+
+    assert len(messages) > 20
+    assert [message for message in messages if message not in said] == []
