@@ -83,7 +83,7 @@ class PreparedRun:
         if config.learners > 1:
             _module, *flags = keeper.arguments
             group = ("deploy.learners", str(config.learners), str(self.folder.logs))
-            keeper = replace(keeper, arguments=(*group, *flags))
+            keeper = replace(keeper, arguments=(*group, *flags), has_children=True)
         found = [replace(keeper, keeps_run=True, again=resumed, made=self.newest_checkpoint)]
         found += [service(role, i) for role in workers for i in range(role.count(config))]
         return found

@@ -36,6 +36,7 @@ class Spec:
     role: str
     arguments: tuple[str, ...]  # module and flags, as after python -m
     restart: bool  # whether it comes back when it dies
+    has_children: bool = False  # whether it starts processes of its own, which must not outlive it
     keeps_run: bool = False  # whether the run ends with it: when it is done, or when restarts do not help
     again: Callable[[], tuple[str, ...]] = lambda: ()  # more flags of a restart
     made: Callable[[], str] = lambda: ""  # names the newest thing that lasts, such as a checkpoint
@@ -141,7 +142,8 @@ class Supervisor:
     def _note_death(self, child: Child, status: int, now: float) -> None:
         """Record that a process has ended, and when it is started again."""
         child.exits.append(status)
-        _end_group(child.process)
+        if child.spec.has_children:
+            _end_group(child.process)
         life_s = now - child.started
         before, child.made = child.made, child.spec.made()
         is_new = is_a_new_row(child.spec, status, life_s, child.made != before)

@@ -25,10 +25,12 @@ PROG: Final = "topspin release"
 EXAMS: Final[dict[str, dict[str, Any]]] = {
     "paper": {"launch": "paper", "rounds": 1},
     "strong": {"launch": "strong", "rounds": 1},
+    "match": {"launch": "match", "rounds": 1},
+    "serve": {"launch": "serve", "rounds": 1},
+    "elite": {"launch": "elite", "rounds": 1},
     "recovering": {"launch": "paper", "rounds": 5},
 }
-"""What a policy in the box is measured on: the paper's balls, balls with up to 300 rad/s of spin, and five balls in
-a row without a reset of the robot."""
+"""What a policy in the box is measured on: each kind of ball, and five balls in a row without a reset of the robot."""
 
 
 class ReleaseConfig(BaseModel):

@@ -72,7 +72,7 @@ class FollowerService:
         try:
             while not self._has_ended:
                 self.step(stop.is_set())
-            self._lockstep.collected(self._intake, keeps_queue=True)
+            self._give_accounts(is_last=True)
             self._member.state = "done"
         finally:
             self._beat()
@@ -96,12 +96,17 @@ class FollowerService:
             lost = self._intake.finish_update(self._learner_state())
             self._history.note("trained", **self._where(), rollouts=lives(dataset), lost=lives(lost))
             if self._lockstep.agrees(False):
-                self._lockstep.collected(self._intake, keeps_queue=False)
+                self._give_accounts(is_last=False)
         elif not self._has_ended:
             self._member.state = "waiting"
             self._transport.wait(TURN_WAIT_S)
         if self._member.is_due(self._clock()):
             self._beat()
+
+    def _give_accounts(self, is_last: bool) -> None:
+        """Give the leader what its checkpoint needs of this rank; it makes none of parameters that are not finite."""
+        if self.training.is_finite:
+            self._lockstep.collected(self._intake, keeps_queue=is_last)
 
     def _serve(self) -> None:
         self._reception.serve(self._clock())

@@ -28,7 +28,7 @@ from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
 from services.learner.divergence import NOT_FINITE
 from services.learner.generation import next_generation
-from services.learner.group import ALONE, Group, GroupError
+from services.learner.group import ALONE, Group
 from services.learner.intake import Queued
 from services.learner.ledger import Ledger
 from services.learner.lockstep import Lockstep
@@ -201,18 +201,19 @@ class LearnerService:
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
             self._has_nothing_left = True
-        is_whole = True  # whether the ranks of the group are all here
+        saves = True
         try:
             while not self._has_ended:
                 wait = self.step(stop.is_set())
                 if wait > 0:
                     self._transport.wait(wait)
             self._member.state = "done"
-        except GroupError:
-            is_whole = False  # the others' accounts can't be had: the newest checkpoint stays the last one
+        except Exception:
+            # The other ranks end too, and their accounts can't be had: the newest checkpoint stays the last one
+            saves = self._group.size == 1
             raise
         finally:
-            if is_whole:
+            if saves:
                 self.save(is_last=True)
             self._beat()
             self._run_log.close()
