@@ -52,6 +52,12 @@ class PPOConfig(BaseModel):
         description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
         "CPU multiplies it natively",
     )
+    threads: int = Field(
+        1,
+        ge=1,
+        le=1024,
+        description="of the update; more than one pays where each has a core that no actor uses",
+    )
     correction_weight: float = Field(
         500.0,
         ge=0,

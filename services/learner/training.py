@@ -70,7 +70,7 @@ class Training:
         teacher: TeacherConfig = TeacherConfig(),
         frames: int = 0,
     ) -> None:
-        torch.set_num_threads(1)  # more threads fight the actors for the same cores
+        torch.set_num_threads(ppo.threads)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.network: ActorCritic = new_network(network, observation, home_action)

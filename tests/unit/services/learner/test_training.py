@@ -357,3 +357,18 @@ def test_the_action_noise_is_bounded_from_stage_3_on_and_not_before(aiming_log_s
         else:  # smaller noise stays as it is
             assert (after < -1.0).all()
             assert (after > -2.0).all()
+
+
+def test_two_threads_reach_what_one_reaches():
+    before = torch.get_num_threads()
+    trained = []
+    try:
+        for threads in (1, 2):
+            training = make_training(ppo=PPO.model_copy(update={"precision": "float32", "threads": threads}))
+            assert torch.get_num_threads() == threads
+            for epoch in range(2):
+                training.run_epoch([make_rollout(seed=epoch, envs=32)])
+            trained.append(torch.cat([p.detach().ravel() for p in training.network.parameters()]))
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(trained[0], trained[1], rtol=0.0, atol=1e-5)
