@@ -164,8 +164,9 @@ export class Stage {
       this.renderer.setPixelRatio(ratio);
       this.renderer.setSize(width, height, false);
       this.camera.aspect = width / height;
-      this.camera.fov = this.facts.field_of_view_deg * (this.isUpright ? 1.6 : 1);
-      this.camera.setViewOffset(width, height, 0, this.isUpright ? 0.16 * height : 0, width, height);
+      const [right, down] = this.isUpright ? [0, 0.16] : [0.06, 0]; // from the panel, as shares of the picture
+      this.camera.fov = this.facts.field_of_view_deg * (this.isUpright ? 1.6 : 1.1);
+      this.camera.setViewOffset(width, height, -right * width, down * height, width, height);
       this.camera.updateProjectionMatrix();
     }
     this.controls.update();
