@@ -12,17 +12,24 @@ def is_own_page(origin: str | None, host: str, is_local: bool) -> bool:
     Args:
         origin: The header ``Origin``.
         host: The header ``Host``: the address that was asked for.
-        is_local: Whether the server listens on this machine alone. Then a name other than ``localhost`` is somebody's
-            domain that points to 127.0.0.1, so that its own page looks like ours (DNS rebinding).
+        is_local: Whether the server is reached from this machine alone. Then a name other than ``localhost`` is a
+            domain that points to 127.0.0.1, so that somebody's page there looks like ours (DNS rebinding).
     """
     if origin is None:
         return True
     page, asked = urlsplit(origin), urlsplit(f"//{host}")
-    return page.netloc == asked.netloc and (not is_local or is_local_name(asked.hostname or ""))
+    return page.netloc == asked.netloc and (not is_local or _is_nobodys_domain(asked.hostname or ""))
 
 
-def is_local_name(name: str) -> bool:
-    """Return whether a host's name can only be this machine, or is a plain address, which is nobody's domain."""
+def is_loopback(address: str) -> bool:
+    """Return whether an address to listen at is reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return address == "localhost"
+
+
+def _is_nobodys_domain(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:

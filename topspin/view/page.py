@@ -23,7 +23,7 @@ from topspin.view.cameras import Cameras
 from topspin.view.config import ViewConfig
 from topspin.view.curves import read_curves
 from topspin.view.game import YOUR_BALL, Choice, Game, RobotChoice
-from topspin.view.origin import is_local_name, is_own_page
+from topspin.view.origin import is_loopback, is_own_page
 from topspin.view.panel import Panel, Request
 from topspin.view.picture import picture_at
 from topspin.view.playback import Pace, Playback
@@ -49,7 +49,7 @@ class LocalServer(viser.ViserServer):
             connection = server._live_connections[client.client_id]
             asked = connection.request.headers if connection.request is not None else {}
             origin = asked.get("Origin")
-            if not is_own_page(origin, asked.get("Host", ""), is_local_name(host)):
+            if not is_own_page(origin, asked.get("Host", ""), is_loopback(host)):
                 log.warning("a page of %s was refused; allowed: the page at http://%s:%d", origin, host, port)
                 await connection.close(1008, "not a page of this server")
 

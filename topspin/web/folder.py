@@ -17,7 +17,7 @@ from common.task.randomization import RallyParameter
 from common.task.states import Outcome
 from topspin.export.folder import whole_folder, write_network
 from topspin.render.overlay import BAD_RGB, GOOD_RGB, OUTCOME_WORDS
-from topspin.render.scene import CAMERAS, FIELD_OF_VIEW_DEG, SPIN_RGB, TARGET_RGB, TRAIL
+from topspin.render.scene import CAMERAS, FIELD_OF_VIEW_DEG, TARGET_RGB, TRAIL
 from topspin.view.shapes import Robot
 from topspin.web import packages
 from topspin.web.module import ball_module
@@ -60,7 +60,7 @@ def write_page(policy: Policy, name: str, out: Path, expected_spin: MatchSpin = 
         (folder / "values.bin").write_bytes(block.content)
         (folder / "robot.xml").write_text(robot_xml(task.robot))
         _write_balls(task, folder / "balls")
-        facts = {"policy": name, "frames": policy.contract.frames, "places": block.places}
+        facts = {"policy": name, "places": block.places}
         facts |= {"robot": _robot_facts(robot), "scene": _scene_facts(task.robot), **_rally_facts()}
         (folder / "page.json").write_text(json.dumps(facts))
     return parity
@@ -107,7 +107,7 @@ def _scene_facts(robot: str) -> dict[str, Any]:
         "shapes": [asdict(shape) for shape in drawn.shapes],
         "ball_radius": BALL_RADIUS,
         "trail": [{"colour": colour.rgb, "label": colour.label} for _, colour in sorted(TRAIL.items())],
-        "colours": {"good": GOOD_RGB, "bad": BAD_RGB, "spin": SPIN_RGB, "target": TARGET_RGB},
+        "colours": {"good": GOOD_RGB, "bad": BAD_RGB, "target": TARGET_RGB},
         "cameras": {"wide": asdict(CAMERAS["side"]), "upright": asdict(CAMERAS["behind"])},
         "field_of_view_deg": FIELD_OF_VIEW_DEG,
     }

@@ -71,7 +71,7 @@ export class Ball {
     const env = {
       __linear_memory: memory,
       __stack_pointer: new WebAssembly.Global({ value: "i32", mutable: true }, STACK_TOP),
-      __indirect_function_table: new WebAssembly.Table({ initial: 8, element: "anyfunc" }),
+      __indirect_function_table: new WebAssembly.Table({ initial: 64, element: "anyfunc" }),
     };
     for (const { name, kind } of WebAssembly.Module.imports(module)) {
       if (kind !== "function") continue;

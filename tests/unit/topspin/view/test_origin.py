@@ -2,7 +2,7 @@
 
 import pytest
 
-from topspin.view.origin import is_own_page
+from topspin.view.origin import is_loopback, is_own_page
 
 pytest.importorskip("viser", reason="viser is missing: pip install -e '.[view]'")
 
@@ -27,6 +27,14 @@ HOME, NETWORK = True, False  # what the server listens at
 )
 def test_only_a_page_of_the_same_address_may_stay(origin, host, is_local, may_stay):
     assert is_own_page(origin, host, is_local) == may_stay
+
+
+@pytest.mark.parametrize(
+    ("address", "is_home"),
+    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("lab.example", False)],
+)
+def test_only_loopback_is_reached_from_this_machine_alone(address, is_home):
+    assert is_loopback(address) == is_home
 
 
 @pytest.fixture(scope="module")
