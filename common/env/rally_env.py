@@ -86,7 +86,7 @@ class EnvStep:
 
 
 @kernel
-def _draw_robot(
+def draw_robot(
     seeds: npt.NDArray[np.uint64],
     profile: RandomizationProfile,
     carry_over: float,
@@ -353,7 +353,7 @@ class RallyEnv:
         self._rounds[rows] = np.where(same_episode, self._rounds[rows] + 1, 1)
         gains, offset = np.empty((rows.size, 3, ACTION_SIZE)), np.empty((rows.size, ACTION_SIZE))
         task, experience = self.task, self.experience
-        stays, continues, ends = _draw_robot(
+        stays, continues, ends = draw_robot(
             new.seeds, self._profile, task.carry_over, task.reset_spread, gains, offset
         )
         self.robot.set_gains(rows, gains, self._rallies.parameters[rows, RallyParameter.ACTION_LATENCY])

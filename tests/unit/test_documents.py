@@ -98,7 +98,7 @@ def check_flags(program, flags, monkeypatch):
         )
         named = next(k for k, word in enumerate(flags) if word.startswith("--"))  # runs stand before
         printed(lambda: load(model, flags[named:], prog=program, section=SECTION))
-    elif program != "pytest":
+    elif program not in ("pytest", "http.server"):
         parts = program.replace("topspin_robot", "topspin.robot").split(".")
         path = ROOT.joinpath(*parts)
         assert path.with_suffix(".py").is_file() or (path / "__main__.py").is_file(), program

@@ -3,6 +3,8 @@
 import logging
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -22,13 +24,13 @@ CHECKED: Final = 1000  # observations on which the written network is compared w
 TOLERANCE: Final = 1e-5  # largest difference of an action
 
 
-def check_free(out: Path) -> None:
-    """Raise ReportedError unless ``out`` is new or an empty folder."""
+def check_free(out: Path, flag: str = "--out") -> None:
+    """Raise ReportedError unless ``out``, which ``flag`` names, is new or an empty folder."""
     if out.is_dir() and not any(out.iterdir()):
         return
     if out.exists() or out.is_symlink():
         kind = "is not empty" if out.is_dir() else "is no folder"
-        raise ReportedError(f"{out} {kind}; allowed: a new or an empty folder (--out)")
+        raise ReportedError(f"{out} {kind}; allowed: a new or an empty folder ({flag})")
 
 
 def export_policy(
@@ -49,13 +51,24 @@ def export_policy(
         raise PolicyError(
             f"policy {name!r} observes the true spin; allowed: a policy with spin estimated or hidden"
         )
+    with whole_folder(out) as fresh:
+        return _write(policy, name, fresh, expected_spin)
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """Yield a folder beside ``out`` to write into, which then becomes ``out``; after an error ``out`` is untouched.
+
+    Raises:
+        ReportedError: It can't be written.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     except OSError as error:
         raise ReportedError(f"can't write beside {out}: {error.strerror}") from None
     try:
-        result = _write(policy, name, fresh, expected_spin)
+        yield fresh
         fresh.chmod(0o755)
         if out.is_dir():
             out.rmdir()
@@ -64,29 +77,39 @@ def export_policy(
         raise ReportedError(f"can't write {out}: {error.strerror}") from None
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
-    return result
 
 
-def _write(policy: Policy, name: str, folder: Path, expected_spin: MatchSpin) -> tuple[RobotContract, float]:
+def write_network(
+    policy: Policy, name: str, folder: Path, expected_spin: MatchSpin = "contract"
+) -> tuple[RobotContract, float]:
+    """Write a policy's network; return its contract, and the largest difference of an action from the policy's.
+
+    Raises:
+        ReportedError: A library is missing, or the written network is not the policy's.
+    """
     try:  # an extra
         import onnx  # noqa: PLC0415
 
-        from topspin.export.leapp import leapp_yaml  # noqa: PLC0415
-        from topspin.export.model_card import model_card  # noqa: PLC0415
         from topspin.export.onnx_graph import add_metadata, policy_graph  # noqa: PLC0415
         from topspin.export.robot_contract import robot_contract  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise ReportedError(f"an export needs {error.name}: pip install -e '.[export]'") from None
-    expecting = policy.contract.expecting(expected_spin)
-    outline = robot_contract(expecting, name, "")
+    outline = robot_contract(policy.contract.expecting(expected_spin), name, "")
     model = policy_graph(policy, outline.of_joints("middle"), outline.of_joints("half_range"))
     add_metadata(model, outline)
     onnx.save_model(model, folder / POLICY_FILE)
-    contract = outline.model_copy(update={"policy_sha256": sha256_of(folder / POLICY_FILE)})
-    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
     parity = parity_of(policy, folder / POLICY_FILE)
     if not parity <= TOLERANCE:  # not-a-number too
         raise ReportedError(f"the written network's actions differ by {parity:.1e}; allowed: {TOLERANCE:g}")
+    return outline.model_copy(update={"policy_sha256": sha256_of(folder / POLICY_FILE)}), parity
+
+
+def _write(policy: Policy, name: str, folder: Path, expected_spin: MatchSpin) -> tuple[RobotContract, float]:
+    contract, parity = write_network(policy, name, folder, expected_spin)
+    from topspin.export.leapp import leapp_yaml  # noqa: PLC0415
+    from topspin.export.model_card import model_card  # noqa: PLC0415
+
+    (folder / CONTRACT_FILE).write_text(contract.model_dump_json(indent=2) + "\n")
     wheel = build_wheel(folder).name
     example = EXAMPLE.read_text()
     (folder / "example.py").write_text(example)

@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Final, cast
 
 import viser
+from viser.infra import WebsockClientConnection
 
 from common.errors import ReportedError
 from common.evaluation.rally_recorder import RecordedRally
@@ -22,6 +23,7 @@ from topspin.view.cameras import Cameras
 from topspin.view.config import ViewConfig
 from topspin.view.curves import read_curves
 from topspin.view.game import YOUR_BALL, Choice, Game, RobotChoice
+from topspin.view.origin import is_loopback, is_own_page
 from topspin.view.panel import Panel, Request
 from topspin.view.picture import picture_at
 from topspin.view.playback import Pace, Playback
@@ -34,8 +36,25 @@ _TEXT_EVERY_S: Final = 0.2  # texts change slowly enough to be read
 _CURVES_EVERY_S: Final = 5.0
 
 
-class _LocalServer(viser.ViserServer):
-    """A server that only this machine, or the address that was asked for, can reach."""
+class LocalServer(viser.ViserServer):
+    """A server for its own page alone, at the address that was asked for."""
+
+    def __init__(self, host: str, port: int) -> None:
+        super().__init__(host, port, verbose=False)
+        server = self._websock_server  # viser itself asks for no origin, and has no setting for it
+
+        async def refuse_other_sites(
+            client: WebsockClientConnection,
+        ) -> None:  # before anything is sent or read
+            connection = server._live_connections[client.client_id]
+            asked = connection.request.headers if connection.request is not None else {}
+            origin = asked.get("Origin")
+            if not is_own_page(origin, asked.get("Host", ""), is_loopback(host)):
+                log.warning("a page of %s was refused; allowed: the page at http://%s:%d", origin, host, port)
+                await connection.close(1008, "not a page of this server")
+
+        server.on_client_connect(refuse_other_sites)
+        server.disconnect_all_clients()  # those that were faster; a page connects again
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refuse: viser's share button would show the page to the internet, through a relay."""
@@ -55,7 +74,7 @@ class Page:
         self._run, self._game = run, Game(config, run)
         rally = self._game.next_ball()  # before the page is there: the first one may compile kernels
         with _quiet():
-            self._server = _LocalServer(config.host, port, verbose=False)
+            self._server = LocalServer(config.host, port)
         self._cameras, self._stage = Cameras(self._server), Stage(self._server)
         choice, policies = self._game.choice, self._game.policies
         self._panel = Panel(self._server, choice, policies, config.slow, run is not None)

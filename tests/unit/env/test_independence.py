@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from common.env.rally_env import _draw_robot
+from common.env.rally_env import draw_robot
 from common.task.config import TaskConfig
 from common.task.launch import Purpose, draw_rallies
 from common.task.randomization import PROFILES, RALLY_PARAMETERS, RallyParameter, draw_parameters
@@ -30,7 +30,7 @@ def drawn_numbers() -> dict[str, np.ndarray]:
     for seed, launch, row in zip(block.seeds, block.launches, parameters, strict=True):
         draw_parameters(seed, launch[9], launch[10], launch[11], profile, row)
     gains, offset = np.empty((RALLIES, 3, 7)), np.empty((RALLIES, 7))
-    _, continues, ends = _draw_robot(block.seeds, profile, 0.5, 0.1, gains, offset)
+    _, continues, ends = draw_robot(block.seeds, profile, 0.5, 0.1, gains, offset)
     found = {f"launch {k}": block.launches[:, k] for k in range(9)}
     found |= {p.name: parameters[:, p] for p in RallyParameter if p not in NOT_ALWAYS_DRAWN}
     found |= {f"gain {g} of joint {j}": gains[:, g, j] for g in range(3) for j in range(7)}
