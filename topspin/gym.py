@@ -6,22 +6,20 @@
     env = gymnasium.make("topspin/Rally-v0", randomization="off", stage=3)
     envs = gymnasium.make_vec("topspin/Rally-v0", num_envs=512)
 
-The vector environment is the batch itself (one call steps all robots), not copies of the single one. It starts the next
-episode in the same step; the last observation is ``final_obs``, and the rally's facts are ``final_info``.
+The vector environment is the batch itself (one call steps all robots), not copies of the single one: ``gym_vector``.
 
 Observations are the policy's: the simulator's truth, which only our critic observes, is left out whatever the settings
 say. Every rally is an episode that is played to its end, unless ``end_at_hit_share`` or ``continue_share`` is given.
 """
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final, NoReturn, TypeVar
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
 from pydantic import BaseModel, ValidationError
 
 from common.env.local_rallies import LocalRallies
@@ -71,7 +69,8 @@ def _of_settings(model: type[_Model], given: dict[str, Any]) -> _Model:
         raise ValueError(f"{name or 'settings'} = {first['input']!r}; {first['msg']}") from None
 
 
-def _check_choices(render_mode: str | None, modes: Sequence[str], stage: int, count: int) -> None:
+def check_choices(render_mode: str | None, modes: list[str], stage: int) -> None:
+    """Raise ValueError for a render mode or a stage that there is not."""
     if render_mode is not None and render_mode not in modes:
         allowed = ", ".join(("None", *map(repr, modes)))
         raise ValueError(
@@ -79,15 +78,20 @@ def _check_choices(render_mode: str | None, modes: Sequence[str], stage: int, co
         )
     if stage not in (1, 2, 3):
         raise ValueError(f"stage {stage!r}; allowed: 1, 2, 3")
-    if count < 1:
-        raise ValueError(f"num_envs {count!r}; allowed: a whole number from 1")
 
 
-class _RallyBatch:
-    """A batch of environments with rallies of its own."""
+class RallyBatch:
+    """A batch of environments with rallies of its own.
 
-    def __init__(self, count: int, stage: int, settings: dict[str, Any]) -> None:
-        self._count, self._stage = count, stage
+    Args:
+        count: B.
+        stage: Curriculum stage 1..3.
+        settings: Fields of ``TaskConfig`` and ``ExperienceConfig``, over ``DEFAULTS``.
+        options: More arguments of ``RallyEnv``.
+    """
+
+    def __init__(self, count: int, stage: int, settings: dict[str, Any], **options: Any) -> None:
+        self._count, self._stage, self._options = count, stage, options
         given = {**DEFAULTS, **settings}
         episodes = {name: given.pop(name) for name in _EPISODES}
         self._experience = _of_settings(ExperienceConfig, {"hit_correction": False, **episodes})
@@ -100,7 +104,9 @@ class _RallyBatch:
     def begin(self, seed: int) -> Floats:
         """Return the first observations of a sequence of episodes that the seed alone decides."""
         source = LocalRallies(seed, self.task)
-        self.env = RallyEnv(self._count, self.task, source, self._stage, experience=self._experience)
+        self.env = RallyEnv(
+            self._count, self.task, source, self._stage, experience=self._experience, **self._options
+        )
         return self.env.reset()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> NoReturn:
@@ -117,21 +123,23 @@ class _RallyBatch:
         return self.env
 
 
-def _within(obs: Floats, space: spaces.Box) -> Floats:
+def within(obs: Floats, space: spaces.Box) -> Floats:
     """Return observations clipped to their stated ranges: a blow can throw a ball beyond them."""
     clipped: Floats = np.clip(obs, space.low, space.high)
     return clipped
 
 
-def _warn_of_rendering() -> None:
+def warn_of_rendering() -> None:
+    """Warn that there is no picture."""
     gymnasium.logger.warn("render() without a render_mode returns None; films: topspin play --video FILE")
 
 
-def _fresh_seed(random: np.random.Generator) -> int:
+def fresh_seed(random: np.random.Generator) -> int:
+    """Return a seed of a sequence of episodes."""
     return int(random.integers(2**63))
 
 
-def _facts(finished: FinishedRallies) -> dict[str, npt.NDArray[Any]]:
+def facts(finished: FinishedRallies) -> dict[str, npt.NDArray[Any]]:
     """Return what Gymnasium's users may want to know of rallies that ended."""
     return {
         "outcome": finished.outcomes.astype(np.int64),
@@ -158,9 +166,9 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
     }
 
     def __init__(self, stage: int = 3, render_mode: str | None = None, **settings: Any) -> None:
-        _check_choices(render_mode, self.metadata["render_modes"], stage, 1)
+        check_choices(render_mode, self.metadata["render_modes"], stage)
         self.render_mode = render_mode
-        self._batch = _RallyBatch(1, stage, settings)
+        self._batch = RallyBatch(1, stage, settings)
         self.metadata = {**self.metadata, "render_fps": self._batch.task.control_rate_hz}
         task = self._batch.task
         self._drawing = (
@@ -177,7 +185,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         """Begin an episode: with a seed, everything starts again; without one, the opponent stays the same."""
         super().reset(seed=seed)
         if seed is not None or self._batch.env is None:
-            obs = self._batch.begin(_fresh_seed(self.np_random))
+            obs = self._batch.begin(fresh_seed(self.np_random))
         elif self._next_obs is None:  # in the middle of an episode
             obs = self._batch.env.reset()
         else:
@@ -185,7 +193,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         self._next_obs = None
         if self._drawing is not None:
             self._drawing.show(self._batch.started)
-        return _within(obs[0], self._batch.observation_space), {}
+        return within(obs[0], self._batch.observation_space), {}
 
     def render(self) -> Image | None:
         """Return a picture (540, 960, 3) of the last step with ``rgb_array``; None otherwise.
@@ -193,7 +201,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         At the end of an episode it is the picture before the last step: the environment has begun the next one.
         """
         if self._drawing is None:
-            _warn_of_rendering()
+            warn_of_rendering()
             return None
         return self._drawing.picture()
 
@@ -212,130 +220,11 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
             self._next_obs, obs = step.obs, step.final_obs
         elif self._drawing is not None:
             self._drawing.show(self._batch.started)
-        info = {name: values[0] for name, values in _facts(step.finished).items() if values.size}
+        info = {name: values[0] for name, values in facts(step.finished).items() if values.size}
         return (
-            _within(obs[0], self._batch.observation_space),
+            within(obs[0], self._batch.observation_space),
             float(step.reward[0]),
             bool(step.terminated[0]),
             bool(step.truncated[0]),
             info,
         )
-
-
-class RallyVectorEnv(VectorEnv[Any, Any, Any]):
-    """A batch of robots in one simulation call.
-
-    Args:
-        num_envs: How many.
-        stage: Curriculum stage 1..3, the reward's column.
-        render_mode: None: pictures are those of one environment, and films those of recorded rallies.
-        settings: As for ``RallyGymEnv``.
-    """
-
-    metadata = {  # noqa: RUF012  # Gymnasium's own name and form
-        "render_modes": [],
-        "render_fps": 50,
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        stage: int = 3,
-        render_mode: str | None = None,
-        **settings: Any,
-    ) -> None:
-        _check_choices(render_mode, self.metadata["render_modes"], stage, num_envs)
-        mode = settings.pop("autoreset_mode", AutoresetMode.SAME_STEP)
-        if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(f"autoreset_mode {mode}; allowed: {AutoresetMode.SAME_STEP}")
-        self.num_envs = num_envs
-        self._batch = _RallyBatch(num_envs, stage, settings)
-        self.single_observation_space, self.single_action_space = self._batch.observation_space, ACTION_SPACE
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
-        self.action_space = gymnasium.vector.utils.batch_space(ACTION_SPACE, num_envs)
-        self.render_mode = render_mode
-
-    def reset(
-        self,
-        *,
-        seed: int | Sequence[int] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Floats, dict[str, Any]]:
-        """Begin episodes.
-
-        Args:
-            seed: Decides all episodes from here on; a list of one for each environment is one seed, together.
-            options: ``reset_mask`` (B,) bool: which environments begin a new episode; the others go on.
-        """
-        one = None if seed is None else self._one_seed(seed)
-        mask = (options or {}).get("reset_mask")
-        rows = None if mask is None else self._rows_of(mask, one)
-        super().reset(seed=one)
-        if one is not None or self._batch.env is None:
-            obs = self._batch.begin(_fresh_seed(self.np_random))
-        else:
-            obs = self._batch.env.reset(rows)
-        return _within(obs, self._batch.observation_space), {}
-
-    def render(self) -> None:
-        """Warn: there is no picture."""
-        _warn_of_rendering()
-
-    def _one_seed(self, seed: int | Sequence[int]) -> int:
-        """Return one seed for a seed, or for one of each environment."""
-        if isinstance(seed, int | np.integer):
-            return int(seed)
-        seeds = list(seed)
-        if len(seeds) != self.num_envs or not all(isinstance(s, int | np.integer) and s >= 0 for s in seeds):
-            raise ValueError(f"seed {seed!r}; allowed: a whole number from 0, or {self.num_envs} of them")
-        return int(np.random.SeedSequence(seeds).generate_state(1)[0])
-
-    def _rows_of(self, mask: Any, seed: int | None) -> npt.NDArray[np.intp]:
-        """Return the rows of a reset mask."""
-        given = np.asarray(mask)
-        if given.shape != (self.num_envs,) or given.dtype != np.bool_ or not given.any():
-            raise ValueError(
-                f"reset_mask of shape {given.shape} and {given.dtype}, {np.count_nonzero(given)} set; "
-                f"allowed: ({self.num_envs},) bool, at least one set"
-            )
-        if seed is not None and not given.all():
-            raise ValueError(
-                "seed with a reset_mask; allowed: one of them, since a seed decides all episodes"
-            )
-        if self._batch.env is None and not given.all():
-            raise gymnasium.error.ResetNeeded("reset_mask before reset(): reset all environments first")
-        return np.flatnonzero(given)
-
-    def step(self, actions: Floats) -> tuple[Floats, npt.NDArray[Any], Flags, Flags, dict[str, Any]]:
-        """Play one control step with every robot."""
-        step = self._batch.started.step(actions)
-        infos: dict[str, Any] = {}
-        if step.ended.size:
-            ended = np.zeros(self.num_envs, np.bool_)
-            ended[step.ended] = True
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            for row, obs in zip(
-                step.ended, _within(step.final_obs, self._batch.observation_space), strict=True
-            ):
-                final_obs[row] = obs
-            infos = {"final_obs": final_obs, "_final_obs": ended, "_final_info": ended.copy()}
-            infos["final_info"] = self._final_info(step.finished, ended)
-        rewards = step.reward.astype(np.float64)
-        return (
-            _within(step.obs, self._batch.observation_space),
-            rewards,
-            step.terminated,
-            step.truncated,
-            infos,
-        )
-
-    def _final_info(self, finished: FinishedRallies, ended: Flags) -> dict[str, npt.NDArray[Any]]:
-        """Return each fact as (B,), with its mask: Gymnasium's form of a batch of dicts."""
-        info = {}
-        last = ended[finished.rows]  # others go on over a return
-        for name, values in _facts(finished).items():
-            column = np.zeros(self.num_envs, values.dtype)
-            column[finished.rows[last]] = values[last]
-            info[name], info[f"_{name}"] = column, ended.copy()
-        return info

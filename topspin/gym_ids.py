@@ -13,5 +13,5 @@ def register_envs() -> None:
         gymnasium.register(
             ENV_ID,
             entry_point="topspin.gym:RallyGymEnv",
-            vector_entry_point="topspin.gym:RallyVectorEnv",
+            vector_entry_point="topspin.gym_vector:RallyVectorEnv",
         )

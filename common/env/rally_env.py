@@ -30,6 +30,7 @@ Flags = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.int64]
 
 _GAINS, _RESET = int(Stream.GAINS), int(Stream.RESET)
+_NO_ROWS = np.zeros(0, np.int64)
 
 
 class RallySource(Protocol):
@@ -72,7 +73,7 @@ class FinishedRallies:
 
 @dataclass(frozen=True, slots=True)
 class EnvStep:
-    """The result of one control step. Environments that ended are already reset."""
+    """The result of one control step. Environments that ended are already reset, unless they begin late."""
 
     obs: Floats  # (B, D) observation.critic_layout of the next step: after a reset the new episode's first
     reward: Floats  # (B,)
@@ -129,9 +130,11 @@ class RallyEnv:
             Its history is not longer than the task's.
         keeps_hits: Whether ``rallies.hit`` is written although hits are not corrected.
         profile: Ranges of what differs from rally to rally; None: those that the task names.
+        begins_late: Whether an environment that ended begins its next episode in place of its next control step. That
+            step ignores its action and pays nothing; its robot holds its last target.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # options by name
         self,
         count: int,
         task: TaskConfig,
@@ -144,9 +147,12 @@ class RallyEnv:
         extra_observation: ObservationConfig | None = None,
         keeps_hits: bool = False,
         profile: RandomizationProfile | None = None,
+        begins_late: bool = False,
     ) -> None:
         if path_rows and task.collision == "original":
             raise ValueError("recorded tracks under collision 'original'; allowed: collision 'tailored'")
+        if begins_late and experience.hit_correction:
+            raise ValueError("begins_late with hit_correction; allowed: one of them")
         self.count = count
         self.task = task
         self.experience = experience
@@ -173,6 +179,8 @@ class RallyEnv:
         self._lengths = np.zeros(count, np.int32)
         self._rounds = np.zeros(count, np.int32)
         self._all = np.arange(count)
+        self._begins_late = begins_late
+        self._waiting = _NO_ROWS  # ended, and begin in the next step
         self._obs = np.zeros((count, size(critic_layout(task.observation))), np.float32)
         self._rewards = reward_table()
         self._started = False
@@ -225,6 +233,7 @@ class RallyEnv:
         if rows is None or not self._started:
             rows = self._all
         self._started = False
+        self._waiting = np.setdiff1d(self._waiting, rows)
         if len(self._rallies.track):
             self._rallies.track[rows] = self._new_tracks()[rows]
         self.robot.go_home(rows, np.zeros((rows.size, ACTION_SIZE)))
@@ -245,7 +254,13 @@ class RallyEnv:
             raise ValueError(
                 f"actions of rows {np.flatnonzero(~np.isfinite(clipped).all(axis=1))} aren't finite"
             )
+        begins = self._waiting
+        if begins.size:
+            clipped[begins] = self._rallies.last_action[begins]
+        learnt = self._rallies.track[begins] if len(self._rallies.track) else None
         self._contacts.step(self._rallies, clipped, self._rules, self._profile, self._step)
+        if begins.size:
+            self._forget_step(begins, learnt)
         # The rally continues with the robot at home, but its result says nothing about the policy.
         self._validated[self.robot.faulty] = False
         self._returns += self._step.reward
@@ -267,9 +282,13 @@ class RallyEnv:
                 self._rallies, self._contacts.motion, self.stage == 3
             )
         finished = self._finish(over)
-        if over.size:
-            self._begin(over, continues)
-            self._observe(over)
+        same_episode = np.zeros(begins.size, np.bool_)
+        if self._begins_late:
+            self._waiting, over, continues = ended, over[continues], continues[continues]
+        begins, same_episode = np.append(begins, over), np.append(same_episode, continues)
+        if begins.size:
+            self._begin(begins, same_episode)
+            self._observe(begins)
         return EnvStep(
             obs=self._obs.copy(),
             reward=self._step.reward.astype(np.float32),
@@ -300,6 +319,19 @@ class RallyEnv:
             extra,
         )
         return extra
+
+    def _forget_step(self, rows: Rows, learnt: Array | None) -> None:
+        """Take back what a control step did to rallies ``rows`` that were over before it.
+
+        Args:
+            rows: (n,).
+            learnt: Their flight filters before it (n, TRACK); None: no observation needs the filter.
+        """
+        self._step.outcome[rows] = 0
+        self._step.reward[rows] = 0.0
+        self._step.terms[rows] = 0.0
+        if learnt is not None:
+            self._rallies.track[rows] = learnt
 
     def _make_contacts(self, threads: int) -> Contacts:
         task = self.task

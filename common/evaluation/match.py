@@ -1,7 +1,7 @@
 """Playing a fixed set of rallies with a deterministic policy, every one to its end."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,6 @@ from common.evaluation.opponents import FILLED, FilledDeck, OpponentRallies, in_
 from common.evaluation.robot_measures import RobotMonitor
 from common.evaluation.unplayed_flight import unplayed_flight
 from common.policy.contract import Contract
-from common.policy.folder import Policy
 from common.task.config import PlayConditions, TaskConfig
 from common.task.experience import MATCH
 from common.task.launch import Purpose, RallyBlock, draw_rallies
@@ -29,6 +28,13 @@ def match_task(
 ) -> TaskConfig:
     """Return the task of a match: the contract's, under the match's conditions."""
     return contract.expecting(expected_spin).task.under(conditions)
+
+
+class Acts(Protocol):
+    """Something that plays: a policy."""
+
+    def act(self, obs: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return actions (B, 7) for observations (B, D)."""
 
 
 class FixedRallies:
@@ -69,7 +75,7 @@ def environments(rallies: int, most: int, rounds: int) -> int:
 
 
 def play_match(
-    policy: Policy,
+    policy: Acts,
     rallies: RallyBlock,
     task: TaskConfig,
     envs: int = DEFAULT_ENVS,

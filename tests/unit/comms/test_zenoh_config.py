@@ -24,6 +24,12 @@ def test_only_the_hub_listens_and_only_clients_connect_to_it():
     )
 
 
+def test_a_hub_takes_more_links_than_a_run_of_1000_actors_has():
+    hub = session_settings(ZenohConfig(mode="hub"), attempt_s=2.0)
+
+    assert hub["transport/unicast/max_sessions"] > 1000 + 100  # actors, and all others
+
+
 def test_features_that_corrupt_or_expose_data_are_off():
     settings = session_settings(ZenohConfig(), attempt_s=2.0)
 

@@ -1,0 +1,1 @@
+"""One launch script for each trainer, run in the environment of its own."""

@@ -1,0 +1,1 @@
+"""What the traffic of a run costs as it grows. ``__main__`` is the program."""
