@@ -21,7 +21,10 @@ def main(stop: Event) -> int:
     from services.actor.service import ActorService
 
     if config.index < 0:
-        config = joined(config, sys.argv[1:], PROG, stop)
+        place = joined(config, sys.argv[1:], PROG, stop)
+        if place is None:
+            return DONE
+        config = place
     with connected("actor", config, stop) as (transport, metrics):
         ActorService(config, transport, metrics, new_incarnation()).run(stop)
     return DONE

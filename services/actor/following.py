@@ -42,3 +42,9 @@ def objection(following: Following, generation: int) -> str:
             f"generation {generation} is not that of the followed learner, {following.followed}, which lives"
         )
     return ""
+
+
+def no_learner(run: str, has_tls: bool) -> str:
+    """Return what an actor waits for while its run has no learner."""
+    unknown = ", or the hub does not know this certificate" if has_tls else ""
+    return f"a learner: run {run!r} has none at the hub{unknown}"

@@ -4,7 +4,6 @@ import logging
 import time
 import tomllib
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from threading import Event
@@ -15,29 +14,29 @@ import tomli_w
 from common.comms.codec import DecodeError, decode, encode
 from common.comms.keys import Keys
 from common.comms.messages import JoinRequest, Place
-from common.comms.roles import name_of
 from common.comms.transport import Flow, Reply, Transport
-from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.service.config import load
-from common.service.log import set_up_logging
+from common.service.connection import connected
+from common.service.metrics import Metrics
 from common.service.settings import from_learner
 from services.actor.config import ActorConfig
+from services.actor.following import no_learner
 
 log = logging.getLogger(__name__)
 
 NOT_GIVEN: Final = "0"  # the default of --id
+NEWCOMER: Final = "new"  # id of an actor that has none yet, in its log and metrics
 REQUEST_S: Final = 5.0
 PAUSE_S: Final = 0.5
-SAY_AGAIN_S: Final = 10.0
 
 
 class NoPlaceError(ReportedError):
-    """The actor was stopped before a learner gave it a place, or the place can't be used."""
+    """The learner's answer can't be used."""
 
 
-def joined(config: ActorConfig, argv: Sequence[str], prog: str, stop: Event) -> ActorConfig:
-    """Return the settings of an actor that the learner has given its place.
+def joined(config: ActorConfig, argv: Sequence[str], prog: str, stop: Event) -> ActorConfig | None:
+    """Return the settings of an actor that the learner has given its place; None: a stop was requested before.
 
     Args:
         config: Where the learner is.
@@ -46,14 +45,15 @@ def joined(config: ActorConfig, argv: Sequence[str], prog: str, stop: Event) -> 
         stop: Ends the wait for a learner.
 
     Raises:
-        NoPlaceError: A stop was requested before a learner answered, or the answer can't be used.
+        NoPlaceError: The answer can't be used.
     """
-    set_up_logging(config.log_level, "actor/-")
-    link = open_zenoh(config, stop, name=name_of("actor", config.id), run=config.run)
-    with closing(link) as transport:
-        # With TLS the hub knows it by its certificate's name, so it keeps that
-        name = config.id if config.tls or config.id != NOT_GIVEN else ""
-        place = ask(transport, Keys(config.run), name, stop)
+    # With TLS the hub knows it by its certificate's name, so it keeps that
+    is_named = bool(config.tls) or config.id != NOT_GIVEN
+    newcomer = config.model_copy(update={"id": config.id if is_named else NEWCOMER})
+    with connected("actor", newcomer, stop) as (transport, metrics):
+        place = ask(transport, config, config.id if is_named else "", stop, metrics)
+    if place is None:
+        return None
     with NamedTemporaryFile(suffix=".toml") as file:
         file.write(tomli_w.dumps(settings_of(place)).encode())
         file.flush()
@@ -61,28 +61,26 @@ def joined(config: ActorConfig, argv: Sequence[str], prog: str, stop: Event) -> 
         return load(ActorConfig, flags, prog=prog, section="actor", recorded=Path(file.name))
 
 
-def ask(transport: Transport, keys: Keys, name: str, stop: Event) -> Place:
-    """Return a place in the run; wait until there is a learner that gives one."""
-    request = encode(JoinRequest(actor=name))
-    started = time.monotonic()
-    said = started
+def ask(transport: Transport, config: ActorConfig, name: str, stop: Event, metrics: Metrics) -> Place | None:
+    """Return a place in the run; wait until a learner gives one. None: a stop was requested."""
+    keys, request = Keys(config.run), encode(JoinRequest(actor=name))
+    started, has_said = time.monotonic(), False
     while not stop.is_set():
+        metrics.health.turn()
         answer = transport.request(keys.join(), request, REQUEST_S, Flow.CONTROL).wait()
         if isinstance(answer, Reply):
             try:
                 return decode(answer.payload, Place)
             except DecodeError as error:
                 raise NoPlaceError(
-                    f"run {keys.run!r} gives no place that this release can read: {error}"
+                    f"run {config.run!r} gives no place that this release can read: {error}"
                 ) from None
-        now = time.monotonic()
-        if now - said >= SAY_AGAIN_S:
-            said = now
-            log.warning(
-                "waiting for='a learner of run %s that gives a number' seconds=%.0f", keys.run, now - started
-            )
+        waited = time.monotonic() - started
+        if waited > config.silence_warning_s and not has_said:
+            has_said = True
+            log.warning("waiting for=%r seconds=%.0f", no_learner(config.run, bool(config.tls)), waited)
         stop.wait(PAUSE_S)
-    raise NoPlaceError(f"stopped before a learner of run {keys.run!r} gave this actor a number")
+    return None
 
 
 def settings_of(place: Place) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
 from services.actor.config import ActorConfig
-from services.actor.following import Following, adopted, noted, objection
+from services.actor.following import Following, adopted, no_learner, noted, objection
 from services.actor.player import Player
 from services.actor.rally_buffer import RallyBuffer
 from services.actor.rally_feed import RallyFeed, StopRequested
@@ -181,8 +181,7 @@ class ActorService:
         if not self._transport.connected:
             return f"the link to the hub at {self._config.endpoint}"
         if not self._following.standing:
-            unknown = ", or the hub does not know this certificate" if self._config.tls else ""
-            return f"a learner: run {self._config.run!r} has none at the hub{unknown}"
+            return no_learner(self._config.run, bool(self._config.tls))
         if snapshot is None:
             return self._misfit or f"a policy from the learner on {self._keys.policy()}"
         self._ready = now if self._ready is None else self._ready

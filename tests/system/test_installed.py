@@ -25,7 +25,7 @@ NO_SOURCES = shutil.ignore_patterns("__pycache__", ".numba_cache", "*.egg-info")
 DATA = (
     *(
         f"common/policies/{name}/{file}"
-        for name in ("default", "all", "paper")
+        for name in ("default", "mild", "paper")
         for file in ("contract.json", "weights.safetensors")
     ),
     *("common/robot/robots/rails/robot.xml", "common/robot/robots/usst/robot.toml"),

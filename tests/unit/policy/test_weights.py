@@ -284,7 +284,7 @@ def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     (tmp_path / "default").mkdir()
 
-    assert names() == ["all", "default", "paper"]
+    assert names() == ["default", "mild", "paper"]
     assert policy_folder("default").resolve() == Path(__file__).parents[3] / "common" / "policies" / "default"
     assert load_policy(policy_folder("default")).contract.task.robot == "rails"
     assert policy_folder("./default").resolve() == tmp_path / "default"

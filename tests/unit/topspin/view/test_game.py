@@ -154,7 +154,7 @@ def test_a_taken_port_and_a_foreign_address_are_one_line():
     [
         (["--port", "99999"], r"view.port = '99999' \(--port\); allowed: a whole number, from 0 to 65535"),
         (["--launch", "fast"], "allowed: paper, strong, mixed, match, elite, serve, all"),
-        (["--policy", "all", "--run", "night"], "--policy all with --run night; allowed: one of them"),
+        (["--policy", "mild", "--run", "night"], "--policy mild with --run night; allowed: one of them"),
     ],
 )
 def test_a_bad_setting_is_one_line_that_says_what_is_allowed(flags, line):

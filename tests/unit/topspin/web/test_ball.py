@@ -85,7 +85,7 @@ def differences(folder, task, rallies, steps, launches):
 
 @pytest.mark.parametrize(
     ("policy", "launch", "perception"),
-    [("default", "paper", "cheap"), ("all", "all", "full"), ("paper", "strong", "full")],
+    [("mild", "paper", "cheap"), ("default", "all", "full"), ("paper", "strong", "full")],
 )
 def test_the_pages_ball_flies_bounces_and_is_observed_as_ours(policy, launch, perception, tmp_path):
     task, rallies, steps = recorded(policy, launch, perception, 16)
