@@ -41,11 +41,16 @@ class SlowWire:
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
-        self._loop.run_until_complete(asyncio.start_server(self._connect, "127.0.0.1", self._port))
+        server = self._loop.run_until_complete(asyncio.start_server(self._connect, "127.0.0.1", self._port))
         self._loop.run_forever()
-        for task in asyncio.all_tasks(self._loop):
+        server.close()
+        self._end_all()
+        tasks = asyncio.all_tasks(self._loop)
+        for task in tasks:
             task.cancel()
-        self._loop.run_until_complete(asyncio.sleep(0.05))
+        self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
+        self._loop.run_until_complete(asyncio.sleep(0.05))  # aborted connections close their sockets
+        self._loop.close()
 
     async def _connect(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
