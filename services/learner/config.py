@@ -228,8 +228,8 @@ class LearnerOptions(BaseModel):
     )
     writers: tuple[str, ...] = Field(
         (),
-        description="more writers of the run's curves, besides TensorBoard's: entry points topspin.writers of "
-        "installed packages",
+        description="more writers of the run's curves, besides TensorBoard's: wandb, mlflow, or an entry point "
+        "topspin.writers of an installed package",
     )
     history: str = Field(
         "", description="folder for a history: a line for each event of a rollout; empty: none"

@@ -1,8 +1,8 @@
 """A run's curves: names and values of an epoch's and of an evaluation's scalars, and who writes them.
 
-TensorBoard's events are always written. Other programs, such as Weights & Biases or MLflow, are a writer of the
-person's own: a class that an installed package names in the entry points `topspin.writers`. Topspin itself sends
-nothing anywhere.
+TensorBoard's events are always written. Other programs have a writer: a class that an installed package names in the
+entry points `topspin.writers`. Topspin names those for Weights & Biases and MLflow (`trackers`), and a person's own
+package may name more. Nothing is sent anywhere unless a run names a writer.
 """
 
 import math

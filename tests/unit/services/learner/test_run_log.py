@@ -167,6 +167,6 @@ def test_an_installed_package_offers_a_writer_of_its_own(tmp_path, monkeypatch):
 
     assert (tmp_path / "lines.txt").read_text() == "run night\n100 [('update/kl', 0.5)]\n"
     with pytest.raises(
-        ConfigError, match=r"writers 'wandb': no entry point .* topspin.writers; allowed: .*lines"
+        ConfigError, match=r"writers 'comet': no entry point .* topspin.writers; allowed: .*lines"
     ):
-        own_writers(["wandb"], "night", tmp_path)
+        own_writers(["comet"], "night", tmp_path)
