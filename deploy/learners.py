@@ -6,6 +6,7 @@ So whoever watches the group starts it again as it would a single learner.
 """
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -87,7 +88,17 @@ def main(stop: Event) -> int:
     lines = (logs / f"learner-{rank}.log").read_text(errors="replace").strip().splitlines()
     reason = lines[-1] if lines else "it said nothing"
     sys.stderr.write(f"learner of rank {rank} ended with status {status}: {reason}\n")
-    return status if status > 0 else 128 - status
+    if status < 0:  # this process ends as the rank did: a learner that was killed is started again at once
+        end_by_signal(-status)
+    return status
+
+
+def end_by_signal(number: int) -> None:
+    """End this process by a signal, as if it had met it."""
+    sys.stderr.flush()
+    if number != signal.SIGKILL:
+        signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Promises of every transport about its hub and its members: restarts, liveliness, deadlines, processes."""
 
 import os
+import re
 import signal
 import threading
 import time
@@ -290,7 +291,8 @@ def test_a_session_whose_requests_time_out_on_a_live_link_is_opened_again(monkey
         pass
     client.wait(0.1)
 
-    assert "requests without answer count=3 on a live link" in caplog.text
+    # Three are enough; the last of those that end together may be among them
+    assert re.search(r"requests without answer count=[3-9] on a live link", caplog.text)
     until(lambda: client.reconnect_count == 1)
     answered(client, server, f"{RUN}/ctl")
     until(lambda: (hub.publish(f"{RUN}/policy", b"new", Flow.POLICY), policies.poll())[1] != [])

@@ -83,7 +83,7 @@ def one_line(folder, module, *arguments):
             TOPSPIN,
             "evaluate --policy nowhere",
             1,
-            "no policy 'nowhere'; allowed: a policy folder, or one of all, default, paper",
+            "no policy 'nowhere'; allowed: a policy folder, or one of default, mild, paper",
         ),
         (
             TOPSPIN,

@@ -110,7 +110,7 @@ def test_an_installed_policy_of_the_box_plays_and_trains_in_another_folder(insta
     trained = json.loads(run(tmp_path, installed / "topspin", "train", *flags))
 
     assert place.startswith(str(installed.parent))
-    assert "'all', 'default', 'paper'" in place
+    assert "'default', 'mild', 'paper'" in place
     assert measured["rallies"] == 8
     assert measured["return_rate"] >= 0.5
     assert trained["frames"] >= 1024

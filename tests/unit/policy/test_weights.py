@@ -289,6 +289,6 @@ def test_a_policy_of_the_box_is_found_by_its_name_from_any_folder(tmp_path, monk
     assert load_policy(policy_folder("default")).contract.task.robot == "rails"
     assert policy_folder("./default").resolve() == tmp_path / "default"
     with pytest.raises(
-        PolicyError, match="no policy 'nowhere'; allowed: a policy folder, or one of all, default, paper"
+        PolicyError, match="no policy 'nowhere'; allowed: a policy folder, or one of default, mild, paper"
     ):
         policy_folder("nowhere")

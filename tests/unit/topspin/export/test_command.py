@@ -96,8 +96,8 @@ def test_the_file_alone_says_what_goes_in_and_out(small):
 
 
 def test_the_card_has_metadata_and_every_measured_figure(tmp_path):
-    policy = load_policy(policy_folder("default"))
-    contract, parity = export(policy, tmp_path / "out", "default")
+    policy = load_policy(policy_folder("mild"))
+    contract, parity = export(policy, tmp_path / "out", "mild")
     _, matter, text = (tmp_path / "out" / "README.md").read_text().split("---\n", 2)
     metadata = yaml.safe_load(matter)
 
@@ -166,7 +166,7 @@ def test_the_command_says_what_it_wrote(small, tmp_path, monkeypatch, capsys):
     [
         (
             ["--policy", "nowhere"],
-            r"no policy 'nowhere'; allowed: a policy folder, or one of all, default, paper",
+            r"no policy 'nowhere'; allowed: a policy folder, or one of default, mild, paper",
         ),
         (["--out", "full"], "full is not empty; allowed: a new or an empty folder"),
         (["--out", "file"], "file is no folder; allowed: a new or an empty folder"),
