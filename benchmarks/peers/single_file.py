@@ -19,11 +19,7 @@ class Agent(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.trunk = task.make_trunk()
-        self.mean = nn.Linear(self.trunk.out_features, task.ACTIONS)
-        self.value = nn.Linear(self.trunk.out_features, 1)
-        task.start_layer(self.mean, 0.01, task.HOME)
-        task.start_layer(self.value, 1.0)
-        self.log_std = nn.Parameter(torch.full((task.ACTIONS,), task.LOG_STD))
+        self.mean, self.value, self.log_std = task.make_heads(self.trunk)
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Return means (N, 7) and values (N,) for normalised observations (N, D)."""

@@ -111,6 +111,14 @@ def make_trunk() -> D2RL:
     return trunk
 
 
+def make_heads(trunk: D2RL) -> tuple[nn.Linear, nn.Linear, nn.Parameter]:
+    """Return mean action (N, 32) -> (N, 7), value (N, 32) -> (N, 1) and log standard deviation (7,), as ours start."""
+    mean, value = (nn.Linear(trunk.out_features, outputs) for outputs in (ACTIONS, 1))
+    start_layer(mean, 0.01, HOME)
+    start_layer(value, 1.0)
+    return mean, value, nn.Parameter(torch.full((ACTIONS,), LOG_STD))
+
+
 def start_layer(layer: nn.Module, gain: float, bias: Tensor | None = None) -> None:
     """Initialise a linear layer: orthogonal weights, and a bias of 0 unless it is given."""
     if not isinstance(layer, nn.Linear):

@@ -195,8 +195,7 @@ def _router() -> dict[str, Any]:
 def _workload(role: Role) -> list[dict[str, Any]]:
     if role.name == "actor":
         return [_actors()]
-    spec = _numbered(role)
-    spec = {"replicas": role.count(SITE), **spec}
+    spec = {"replicas": role.count(SITE), **_numbered(role)}
     return [
         _head("apps/v1", "StatefulSet", role.name, labels=labels(role.name)) | {"spec": spec},
         _headless(role),

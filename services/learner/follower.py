@@ -20,7 +20,7 @@ from services.learner.admission import LearnerState
 from services.learner.config import LearnerConfig
 from services.learner.group import Group
 from services.learner.lockstep import Lockstep
-from services.learner.reception import Reception, in_order, lives, new_intake
+from services.learner.reception import Reception, in_order, lives, new_intake, where
 from services.learner.service import TURN_WAIT_S
 from services.learner.training import Training, new_training
 
@@ -49,7 +49,9 @@ class FollowerService:
         self._config, self._transport, self._metrics = config, transport, metrics
         self._group, self._clock = group, clock
         self._history = History(config.history, f"learner-{group.rank}")
-        self._lockstep = Lockstep(group, config.intake.for_actors(config.actors).dataset_rollouts)
+        self._lockstep = Lockstep(
+            group, config.intake.for_actors(config.actors).dataset_rollouts, transport.wait
+        )
         self.training = new_training(config, group)
         self._training_hash = training_hash(config.task, config.network, config.experience)
         self._generation = int(group.of_leader(b""))
@@ -64,7 +66,9 @@ class FollowerService:
         self._has_ended = False
         telemetry.begin(metrics)
         self._reception.members.join()
-        self._history.note("start", **self._where(), waiting=lives(self._intake.waiting))
+        self._history.note(
+            "start", **where(self.training, self._generation), waiting=lives(self._intake.waiting)
+        )
 
     def run(self, stop: Event) -> None:
         """Train until the group ends."""
@@ -86,7 +90,7 @@ class FollowerService:
         """Answer, and train this rank's part of an epoch if the group has a dataset."""
         self._serve()
         dataset, is_complete, self._has_ended = self._lockstep.turn(
-            *(self._intake, self._clock(), is_stopping or self._member.is_draining), self._wait_for_others
+            *(self._intake, self._clock(), is_stopping or self._member.is_draining), self._serve
         )
         if is_complete:
             self._member.state = "training"
@@ -94,7 +98,9 @@ class FollowerService:
             if stats.diverged:
                 self._go_back()
             lost = self._intake.finish_update(self._learner_state())
-            self._history.note("trained", **self._where(), rollouts=lives(dataset), lost=lives(lost))
+            self._history.note(
+                "trained", **where(self.training, self._generation), rollouts=lives(dataset), lost=lives(lost)
+            )
             if self._lockstep.agrees(False):
                 self._give_accounts(is_last=False)
         elif not self._has_ended:
@@ -111,11 +117,6 @@ class FollowerService:
     def _serve(self) -> None:
         self._reception.serve(self._clock())
 
-    def _wait_for_others(self) -> None:
-        """Serve this rank's actors while the other ranks of the group are not here yet."""
-        self._serve()
-        self._transport.wait(0.001)
-
     def _go_back(self) -> None:
         """Return to the leader's last good checkpoint, if it has one."""
         good = self._group.of_leader(b"")
@@ -131,15 +132,6 @@ class FollowerService:
 
     def _learner_state(self) -> LearnerState:
         return self.training.state_of(self._config.run, self._generation, self._training_hash)
-
-    def _where(self) -> dict[str, int]:
-        progress = self.training.progress
-        return {
-            "generation": self._generation,
-            "version": progress.version,
-            "epoch": progress.epoch,
-            "stage_number": progress.stage_number,
-        }
 
     def _beat(self) -> None:
         self._intake.tidy(self._clock())

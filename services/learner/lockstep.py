@@ -13,6 +13,7 @@ from services.learner.intake import Intake, Queued
 from services.learner.telemetry import FATES, fates
 from services.learner.turns import Rank, parts, taken
 
+SOON_S: Final = 0.001  # longest wait between two looks for the other ranks
 RECOUNT_S: Final = 0.5  # time between two looks at which actors bring rollouts
 
 
@@ -22,16 +23,17 @@ class Lockstep:
     Args:
         group: The ranks.
         dataset: Rollouts of a dataset, over all ranks.
+        wait: Waits so many seconds at most, until a message arrives.
     """
 
-    def __init__(self, group: Group, dataset: int) -> None:
-        self.group, self._dataset = group, dataset
+    def __init__(self, group: Group, dataset: int, wait: Callable[[float], object]) -> None:
+        self.group, self._dataset, self._wait = group, dataset, wait
         self._contributors, self._next_count = (0, 0), 0.0
         self.fates = dict.fromkeys(FATES, 0)  # the ledger of all ranks, as of the last turn
         self.queued = 0  # rollouts that wait on all ranks
 
     def turn(
-        self, intake: Intake, now: float, ends: bool, on_tick: Callable[[], None]
+        self, intake: Intake, now: float, ends: bool, serve: Callable[[], None]
     ) -> tuple[tuple[Queued, ...], bool, bool]:
         """Return this rank's rollouts of the next dataset, whether there is one, and whether the group ends.
 
@@ -39,8 +41,13 @@ class Lockstep:
             intake: Of this rank.
             now: The caller's clock [s].
             ends: Whether this rank must stop.
-            on_tick: Called again and again until the other ranks have come.
+            serve: Answers this rank's actors; called again and again until the other ranks have come.
         """
+
+        def on_tick() -> None:
+            serve()
+            self._wait(SOON_S)
+
         if now >= self._next_count:
             self._contributors, self._next_count = intake.contributors(now), now + RECOUNT_S
         mine = fates(intake.total())

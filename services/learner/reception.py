@@ -21,6 +21,7 @@ from services.learner.group import Group
 from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot
 from services.learner.members import Members
+from services.learner.training import Training
 
 ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
 REPORT_MAILBOX: Final = 256  # more than all actors of a run send at once
@@ -151,6 +152,17 @@ def new_intake(
         [entry for entry in queue if group.owns(entry.header.actor)],
         [life for life in extras.closed if group.owns(life[0])],
     )
+
+
+def where(training: Training, generation: int) -> dict[str, int]:
+    """Return what a history says of the training with each event."""
+    progress = training.progress
+    return {
+        "generation": generation,
+        "version": progress.version,
+        "epoch": progress.epoch,
+        "stage_number": progress.stage_number,
+    }
 
 
 def lives(entries: Iterable[Queued]) -> list[tuple[str, int, int]]:

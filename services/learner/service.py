@@ -34,7 +34,7 @@ from services.learner.ledger import Ledger
 from services.learner.lockstep import Lockstep
 from services.learner.members import IDLE_WAIT_S
 from services.learner.places import Registrar
-from services.learner.reception import Reception, in_order, lives, new_intake
+from services.learner.reception import Reception, in_order, lives, new_intake, where
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
 from services.learner.training import new_training
@@ -107,7 +107,7 @@ class LearnerService:
             self._folder.metrics, self._folder.tensorboard, self._folder.evaluations, writers
         )
         self._dataset_rollouts = config.intake.for_actors(config.actors).dataset_rollouts
-        self._lockstep = Lockstep(group, self._dataset_rollouts)
+        self._lockstep = Lockstep(group, self._dataset_rollouts, transport.wait)
         self.training = new_training(config, group)
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
@@ -150,7 +150,9 @@ class LearnerService:
         self._members.join()
         self._broadcast.publish_policy()
         self._broadcast.publish_stage()
-        self._history.note("start", **self._where(), waiting=lives(self._intake.waiting))
+        self._history.note(
+            "start", **where(self.training, self._generation), waiting=lives(self._intake.waiting)
+        )
 
     # ---- state
 
@@ -232,7 +234,7 @@ class LearnerService:
         self._serve()
         ends = is_stopping or self.done
         dataset, is_complete, self._has_ended = self._lockstep.turn(
-            self._intake, self._clock(), ends, self._wait_for_others
+            self._intake, self._clock(), ends, self._serve
         )
         if self._has_ended:
             return 0.0
@@ -248,11 +250,6 @@ class LearnerService:
             self._clocks.next_checkpoint = now + self._config.checkpoint_interval_s
             self.save()
         return 0.0 if is_complete else IDLE_WAIT_S if self._group.size == 1 else TURN_WAIT_S
-
-    def _wait_for_others(self) -> None:
-        """Serve this rank's actors while the other ranks of the group are not here yet."""
-        self._serve()
-        self._transport.wait(0.001)
 
     def save(self, is_last: bool = False) -> None:
         """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
@@ -294,7 +291,11 @@ class LearnerService:
         weights = self.training.weights(self._config.evaluated_weights)
         save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
         self._metrics.set("topspin_checkpoint_time_seconds", time.time())
-        self._history.note("saved", **self._where(), waiting=lives(self._intake.waiting) if is_last else [])
+        self._history.note(
+            "saved",
+            **where(self.training, self._generation),
+            waiting=lives(self._intake.waiting) if is_last else [],
+        )
         log.debug("checkpoint written file=%s", path)
 
     # ---- training
@@ -312,7 +313,9 @@ class LearnerService:
         if stats.diverged:
             self._go_back(stats.diverged)
         lost = self._intake.finish_update(self._learner_state())
-        self._history.note("trained", **self._where(), rollouts=lives(dataset), lost=lives(lost))
+        self._history.note(
+            "trained", **where(self.training, self._generation), rollouts=lives(dataset), lost=lives(lost)
+        )
         self._broadcast.publish_policy()
         if stats.stage_changed:
             self._broadcast.publish_stage()
@@ -347,16 +350,6 @@ class LearnerService:
         self.training.go_back(lambda training: checkpoint.restore(path, training))
         self._metrics.inc("topspin_rollbacks_total")
         log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
-
-    def _where(self) -> dict[str, int]:
-        """Return what the history says of the training with each event."""
-        progress = self.training.progress
-        return {
-            "generation": self._generation,
-            "version": progress.version,
-            "epoch": progress.epoch,
-            "stage_number": progress.stage_number,
-        }
 
     def _learner_state(self) -> LearnerState:
         return self.training.state_of(self._config.run, self._generation, self._training_hash)

@@ -50,11 +50,7 @@ class Policy(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.trunk = task.make_trunk()
-        self.mean = nn.Linear(self.trunk.out_features, task.ACTIONS)
-        self.value = nn.Linear(self.trunk.out_features, 1)
-        task.start_layer(self.mean, 0.01, task.HOME)
-        task.start_layer(self.value, 1.0)
-        self.log_std = nn.Parameter(torch.full((task.ACTIONS,), task.LOG_STD))
+        self.mean, self.value, self.log_std = task.make_heads(self.trunk)
         self.moments = Moments.initial(task.OBS)
 
     def deterministic(self) -> task.Normalized:

@@ -32,11 +32,7 @@ class Module(TorchRLModule, ValueFunctionAPI):
     def setup(self) -> None:
         """Make the layers."""
         self.trunk = task.make_trunk()
-        self.mean = nn.Linear(self.trunk.out_features, task.ACTIONS)
-        self.value = nn.Linear(self.trunk.out_features, 1)
-        task.start_layer(self.mean, 0.01, task.HOME)
-        task.start_layer(self.value, 1.0)
-        self.log_std = nn.Parameter(torch.full((task.ACTIONS,), task.LOG_STD))
+        self.mean, self.value, self.log_std = task.make_heads(self.trunk)
         self.moments = nn.BatchNorm1d(task.OBS, affine=False, momentum=None)  # counts all data alike
         self.moments.eval()
 
