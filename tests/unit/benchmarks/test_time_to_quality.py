@@ -1,8 +1,12 @@
-"""When the goal is reached."""
+"""When the goal is reached, and what several seeds come to."""
 
 import pytest
 
-from benchmarks.time_to_quality import is_reached
+from benchmarks.time_to_quality import Goal, first_passage, spread
+
+GOAL = Goal(0.81, 0.31)
+MET = {"return_rate": "0.82", "target_error_mean": "0.30"}
+MISSED = {"return_rate": "0.80", "target_error_mean": "0.20"}
 
 
 @pytest.mark.parametrize(
@@ -12,4 +16,37 @@ from benchmarks.time_to_quality import is_reached
 def test_the_goal_is_reached_if_both_figures_are(returned, error, reached):
     row = {"return_rate": returned, "target_error_mean": error}
 
-    assert is_reached(row, 0.81, 0.31) is reached
+    assert GOAL.is_met(row) is reached
+
+
+@pytest.mark.parametrize(
+    ("curve", "asked", "confirmed", "passage"),
+    [
+        ([], 0, True, None),
+        ([MISSED], 0, True, None),
+        ([MET], 0, True, MET),
+        ([MET], 0, False, None),  # lucky balls
+        ([MET], 1, True, None),  # looked at before
+        ([MET, MISSED], 0, True, None),  # its policy is no longer at hand
+    ],
+)
+def test_a_passage_counts_only_if_other_balls_confirm_it(curve, asked, confirmed, passage):
+    assert first_passage(curve, asked, GOAL, lambda: confirmed) == (len(curve), passage)
+
+
+def test_a_policy_that_misses_the_goal_plays_no_other_balls():
+    def fails():
+        raise AssertionError("it was measured")
+
+    first_passage([MISSED], 0, GOAL, fails)
+
+
+def test_runs_that_missed_the_goal_count_as_slower_than_all_others():
+    runs = [
+        {"reached": True, "minutes": 8.0},
+        {"reached": False, "minutes": 3.0},
+        {"reached": True, "minutes": 6.5},
+    ]
+
+    assert spread(runs, "minutes") == {"median": 8.0, "lowest": 6.5, "highest": None}
+    assert spread(runs[1:2], "minutes") == {"median": None, "lowest": None, "highest": None}

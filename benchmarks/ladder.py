@@ -1,0 +1,174 @@
+"""From the paper's recipe to the default, one change at a time: what each is worth.
+
+    python -m benchmarks.ladder --frames 15000000 --seeds 1 --json
+
+Every rung trains with all changes of the rungs below it and one of its own. The first is recipe ``paper-50hz``, the
+last has the default's settings. A rung's worth depends on those below it: another order would give other figures.
+Runs are in runs/NAME-RUNG-SEED. What is trained already is not trained again, so the program goes on where it was
+stopped, and two of it can share the rungs (``--rungs``).
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from threading import Event
+from typing import Any, Final, NamedTuple
+
+from pydantic import Field
+
+from benchmarks.recipe import MEASURES, median, result
+from benchmarks.settings import BenchmarkConfig, run
+from common.errors import ReportedError
+from common.service.process import DONE
+from common.service.run_folder import RunFolder
+from topspin.report.collect import find
+
+RECIPE: Final = "paper-50hz"
+
+
+class Rung(NamedTuple):
+    """One change."""
+
+    name: str
+    flags: dict[str, str]  # of ``topspin train``, with those of the rungs below it
+
+
+RUNGS: Final = (
+    Rung("the paper's recipe at 50 Hz", {}),
+    Rung(
+        "the normaliser's new count is absorbed, and the mean of the weights is kept",
+        {"learner.curriculum.count-reset": "absorbed", "learner.evaluated-weights": "mean"},
+    ),
+    Rung(
+        "small first noise; smaller datasets, larger minibatches, fewer passes; the learning rate follows the KL",
+        {
+            "network.initial-log-std": "-1.6",
+            "actor.horizon": "32",
+            "actor.envs": "0",
+            "learner.ppo.mini-epochs": "4",
+            "learner.ppo.minibatch": "2048",
+            "learner.ppo.schedule": "adaptive",
+            "learner.ppo.learning-rate-min": "2e-5",
+            "learner.ppo.value-weight": "1",
+            "learner.ppo.bound-weight": "0.001",
+            "learner.ppo.reward-scale": "0.1",
+            "learner.divergence.collapse": "0.5",
+        },
+    ),
+    Rung(
+        "a longer view: gamma 0.99 and lambda 0.9 a step of 20 ms",
+        {"learner.ppo.gamma": "0.99", "learner.ppo.gae-lambda": "0.9"},
+    ),
+    Rung("the critic sees the simulator's truth", {"task.observation.critic": "privileged"}),
+    Rung(
+        "our reward: a steeper landing, a bonus for it, entries by time a quarter",
+        {
+            "task.reward.landing-scale": "0.5",
+            "task.reward.landing-bonus": "100",
+            "task.reward.reference-rate-hz": "50",
+            "task.reward.collision": "10",
+        },
+    ),
+    Rung(
+        "spin estimate, prediction and sample age are observed",
+        {
+            "task.observation.spin": "estimated",
+            "task.observation.prediction": "true",
+            "task.observation.age": "true",
+        },
+    ),
+    Rung(
+        "hits are corrected",
+        {
+            "experience.hit-correction": "true",
+            "learner.ppo.correction-weight": "500",
+            "learner.ppo.refit-epochs": "24",
+            "learner.curriculum.aiming-log-std": "-2.5",
+        },
+    ),
+    Rung(
+        "short stages 1 and 2; episodes of several rallies, most of which end at the hit; full aerodynamics",
+        {
+            "learner.curriculum.stage-shares": "",
+            "experience.continue-share": "0.1",
+            "experience.end-at-hit-share": "0.8",
+            "task.flight": "full",
+        },
+    ),
+)
+
+
+class LadderConfig(BenchmarkConfig):
+    """Train from the paper's recipe to the default, one change a rung, and print what each reaches."""
+
+    frames: int = Field(
+        15_000_000, ge=1, description="of each training", json_schema_extra={"unit": "frames"}
+    )
+    seeds: tuple[int, ...] = Field((1,), description="seeds of each rung: 1,2")
+    rungs: tuple[int, ...] = Field((), description="which rungs are trained, from 0; empty: all")
+    run: str = Field("ladder", min_length=1, description="name of the runs, before -RUNG-SEED")
+    train: bool = Field(True, description="false: print what is there")
+
+
+def flags_of(rung: int) -> list[str]:
+    """Return the flags of a rung: its own and those of the rungs below it."""
+    together: dict[str, str] = {}
+    for one in RUNGS[: rung + 1]:
+        together |= one.flags
+    return [part for name, value in together.items() for part in (f"--{name}", value)]
+
+
+def train(config: LadderConfig, rung: int, seed: int, stop: Event) -> None:
+    """Train one rung with one seed, or go on with it; nothing if its end is measured.
+
+    Raises:
+        ReportedError: The training failed.
+    """
+    name = f"{config.run}-{rung}-{seed}"
+    folder = RunFolder.of(name)
+    if folder.final.is_file():
+        return
+    flags = ["--resume"] if folder.config.is_file() else ["--recipe", RECIPE, "--seed", str(seed)]
+    if "--resume" not in flags:
+        flags += ["--frames", str(config.frames), *flags_of(rung)]
+    command = [sys.executable, "-m", "topspin", "train", "--run", name, "--panel", "off", *flags]
+    print(f"rung {rung}, seed {seed}: {RUNGS[rung].name}", file=sys.stderr, flush=True)
+    done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
+    if done.returncode and not stop.is_set():
+        raise ReportedError(f"training {name} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
+
+
+def figures(config: LadderConfig, rungs: Sequence[int]) -> list[dict[str, Any]]:
+    """Return what the runs of each rung reached; rungs without a measured run are left out."""
+    found = []
+    for rung in rungs:
+        names = [f"{config.run}-{rung}-{seed}" for seed in config.seeds]
+        runs = [result(find(name)) for name in names if RunFolder.of(name).final.is_file()]
+        if runs:
+            middle = {key: median(runs, key) for key in MEASURES}
+            found.append({"rung": rung, "name": RUNGS[rung].name, "runs": runs, "median": middle})
+    return found
+
+
+def main(config: LadderConfig, stop: Event) -> int:
+    """Train what is missing, and print every rung."""
+    rungs = config.rungs or tuple(range(len(RUNGS)))
+    if wrong := [rung for rung in rungs if not 0 <= rung < len(RUNGS)]:
+        raise ReportedError(f"no rung {wrong[0]}; allowed: 0 to {len(RUNGS) - 1}")
+    for rung in rungs if config.train else ():
+        for seed in config.seeds:
+            if not stop.is_set():
+                train(config, rung, seed, stop)
+    found = figures(config, range(len(RUNGS)))
+    if config.json_line:
+        print(json.dumps({"frames": config.frames, "ladder": found}))
+        return DONE
+    for one in found:
+        each = "  ".join(f"{key} {one['median'][key]}" for key in MEASURES)
+        print(f"{one['rung']}  {each}  ({len(one['runs'])} seeds)  {one['name']}")
+    return DONE
+
+
+if __name__ == "__main__":
+    sys.exit(run("ladder", LadderConfig, main))

@@ -1,0 +1,58 @@
+"""The ladder's rungs, and what it prints of finished runs."""
+
+import json
+from threading import Event
+
+import pytest
+
+from benchmarks.ladder import RECIPE, RUNGS, LadderConfig, flags_of, main
+from benchmarks.recipe import differences, known_settings
+from common.errors import ReportedError
+from common.service.config import save_settings, to_tables
+from common.service.run_folder import RunFolder
+from deploy.config import settings
+from topspin.report.groups import experiment
+
+
+def settings_of(rung):
+    config = settings(("--run", "r", "--recipe", RECIPE, *flags_of(rung)), "p")
+    return experiment(to_tables(config, "local"))
+
+
+def test_the_ladder_leads_from_the_papers_recipe_to_the_default():
+    known = known_settings()
+
+    assert differences(settings_of(0), known[RECIPE]) == []
+    assert differences(settings_of(len(RUNGS) - 1), known["default"]) == []
+
+
+@pytest.mark.parametrize("rung", range(1, len(RUNGS)))
+def test_each_rung_changes_what_its_flags_name_and_nothing_else(rung):
+    changed = differences(settings_of(rung), settings_of(rung - 1))
+
+    named = {flag.replace("-", "_") for flag in RUNGS[rung].flags}
+    assert {change.split()[0] for change in changed} == named
+
+
+def test_measured_runs_are_printed_by_rung(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for rung, seed, rate in ((0, 1, 0.2), (0, 2, 0.4), (3, 1, 0.7)):
+        folder = RunFolder.of(f"ladder-{rung}-{seed}")
+        folder.create()
+        config = settings(("--run", "r", "--recipe", RECIPE, *flags_of(rung), "--seed", str(seed)), "p")
+        save_settings(folder.config, to_tables(config, "local"))
+        measured = {"return_rate": rate, "return_after_catch": rate, "target_error_mean": 0.5, "frames": 1000}
+        folder.final.write_text(json.dumps(measured))
+
+    assert main(LadderConfig(seeds=(1, 2), train=False, json_line=True), Event()) == 0
+
+    found = json.loads(capsys.readouterr().out)["ladder"]
+    assert [(rung["rung"], rung["median"]["return_rate"], len(rung["runs"])) for rung in found] == [
+        (0, 0.3, 2),
+        (3, 0.7, 1),
+    ]
+
+
+def test_a_rung_that_is_not_there_is_refused():
+    with pytest.raises(ReportedError, match=f"^no rung 9; allowed: 0 to {len(RUNGS) - 1}$"):
+        main(LadderConfig(rungs=(9,)), Event())
