@@ -137,7 +137,9 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
                 )
                 time.sleep(LOOK_S)
             if passage is not None:
-                reported = measure(name, REPORTED_SEED)  # of the policy that passed, before a better one comes
+                reported = measure(
+                    name, REPORTED_SEED
+                )  # of the policy that passed, before a better one comes
         finally:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
