@@ -45,6 +45,15 @@ class Moments:
         """Return the moments of the first ``size`` numbers."""
         return Moments(self.mean[:size], self.var[:size], self.count)
 
+    def followed_by(self, longer: "Moments") -> "Moments":
+        """Return these moments, and those of ``longer`` for the numbers after them."""
+        size = len(self.mean)
+        return Moments(
+            np.concatenate([self.mean, longer.mean[size:]]),
+            np.concatenate([self.var, longer.var[size:]]),
+            self.count,
+        )
+
     def recounted(self) -> "Moments":
         """Return the same mean and variance with count 1: what a stage change does (the paper's algorithm 1)."""
         return Moments(self.mean, self.var, 1)

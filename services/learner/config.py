@@ -208,6 +208,11 @@ class LearnerOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    start_policy: str = Field(
+        "",
+        description="policy that a new run starts from, by its name in the box or its folder: with its "
+        "network.units and observation, in its stage; empty: new weights",
+    )
     ppo: PPOConfig = PPOConfig()
     curriculum: CurriculumConfig = CurriculumConfig()
     divergence: DivergenceConfig = DivergenceConfig()
@@ -270,6 +275,11 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
         if self.experience.teacher.policy and self.ppo.correction_weight == 0:
             raise ValueError(
                 "ppo.correction_weight 0 with experience.teacher.policy; allowed: above 0 (a teacher needs it)"
+            )
+        if self.experience.teacher.policy and self.start_policy:
+            raise ValueError(
+                f"start_policy {self.start_policy} with experience.teacher.policy {self.experience.teacher.policy}; "
+                "allowed: one of them (a student starts from new weights)"
             )
         self.curriculum.check_budget(self.frames)
         return self

@@ -37,6 +37,7 @@ from services.learner.places import Registrar
 from services.learner.reception import Reception, in_order, lives, new_intake, where
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
+from services.learner.start_policy import start_policy
 from services.learner.training import new_training
 
 log = logging.getLogger(__name__)
@@ -99,8 +100,9 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         task, teacher = config.task, config.experience.teacher
-        if not config.resume:
-            teacher_of(task, teacher)  # before a folder is made
+        if not config.resume:  # before a folder is made
+            teacher_of(task, teacher)
+            start_policy(config)
         self._folder.create()
         writers = own_writers(config.writers, config.run, self._folder.root)
         self._run_log = RunLog(

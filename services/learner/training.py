@@ -13,6 +13,7 @@ from common.comms.messages import Rollout
 from common.env.robot import home_action
 from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
+from common.policy.folder import Policy
 from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
@@ -32,6 +33,7 @@ from services.learner.divergence import Health, divergence, running_mean, watche
 from services.learner.epoch_stats import EpochStats, Progress
 from services.learner.group import ALONE, Group
 from services.learner.ppo import LearningRate, UpdateMode, precision_of, update
+from services.learner.start_policy import start_policy
 
 Floats = npt.NDArray[np.float32]
 
@@ -95,6 +97,24 @@ class Training:
         self.obs_moments = Moments.initial(self.obs_size)
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
         self.progress = Progress(stage=curriculum.first_stage, learning_rate=ppo.learning_rate)
+        self.has_start_policy = False
+
+    @torch.no_grad()
+    def start_from(self, policy: Policy) -> None:
+        """Take over a trained policy before the first epoch. The new critic learns first, and then both, slowly.
+
+        Args:
+            policy: Of the same network and observation (``start_policy``).
+        """
+        for network in (self.network, self.average):
+            for own, theirs in zip(
+                network.policy_parameters(), policy.network.policy_parameters(), strict=True
+            ):
+                own.copy_(theirs)
+        self.network_pass.refresh()
+        self.obs_moments = policy.moments.followed_by(self.obs_moments).recounted()
+        self.has_start_policy = True
+        self.progress = replace(self.progress, learning_rate=self.ppo.learning_rate_min, refitting=True)
 
     @property
     def datasets_left(self) -> int:
@@ -171,9 +191,12 @@ class Training:
             moments = moments.merged(part)
         # No tick until the weights below have changed too: a request then gets a consistent policy.
         self.obs_moments = moments
-        if before.stage_number > 0 and self.curriculum.count_reset == "absorbed":
+        takes_over = self.has_start_policy and before.version == 0
+        if (before.stage_number > 0 or takes_over) and self.curriculum.count_reset == "absorbed":
             # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset. The
             # network must not play differently because of it.
+            if takes_over:  # the new critic's own numbers had no moments before
+                frozen = frozen.first(self.network.obs_size).followed_by(moments)
             for network in (self.network, self.average):
                 network.renormalize(frozen, self.obs_moments)
         self._update_ema()
@@ -282,7 +305,11 @@ class Training:
 
 
 def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
-    """Return the training of a run at its start, of one rank of a group."""
+    """Return the training of a run at its start, of one rank of a group.
+
+    Raises:
+        PolicyError: The policy that it is to start from does not fit.
+    """
     training = Training(
         config.ppo,
         config.network,
@@ -296,4 +323,6 @@ def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
         frames=config.frames,
     )
     training.group = group
+    if (policy := start_policy(config)) is not None:
+        training.start_from(policy)
     return training

@@ -7,7 +7,7 @@ from common.comms.messages import Episodes, Rollout
 OBS, ACTIONS, TERMS = 37, 7, 8
 
 
-def make_rollout(seed=0, steps=16, envs=8, **changes):
+def make_rollout(seed=0, steps=16, envs=8, obs_size=OBS, **changes):
     """Return a rollout of random numbers: its content is meaningless, its form is valid."""
     rng = np.random.default_rng(seed)
     ends = rng.uniform(size=(steps, envs))
@@ -22,15 +22,15 @@ def make_rollout(seed=0, steps=16, envs=8, **changes):
         "incarnation": 1,
         "sequence": seed,
         "training_hash": "c",
-        "obs": rng.normal(size=(steps, envs, OBS)).astype(np.float32),
+        "obs": rng.normal(size=(steps, envs, obs_size)).astype(np.float32),
         "actions": rng.normal(size=(steps, envs, ACTIONS)).astype(np.float32) * 0.2,
         "log_mu": rng.normal(size=(steps, envs)).astype(np.float32),
         "rewards": rng.normal(size=(steps, envs)).astype(np.float32),
         "terminated": ends < 0.03,
         "truncated": truncated,
-        "final_obs": rng.normal(size=(int(truncated.sum()), OBS)).astype(np.float32),
+        "final_obs": rng.normal(size=(int(truncated.sum()), obs_size)).astype(np.float32),
         "final_index": np.flatnonzero(truncated).astype(np.int32),
-        "last_obs": rng.normal(size=(envs, OBS)).astype(np.float32),
+        "last_obs": rng.normal(size=(envs, obs_size)).astype(np.float32),
         "episodes": Episodes(
             outcome=np.array([1, 1, 2, 10, 9], np.uint8),
             target_error=np.array([0.2, 0.4, np.nan, np.nan, np.nan], np.float32),
