@@ -97,7 +97,7 @@ class Training:
         self.obs_moments = Moments.initial(self.obs_size)
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
         self.progress = Progress(stage=curriculum.first_stage, learning_rate=ppo.learning_rate)
-        self.has_start_policy = False
+        self.has_start_policy = False  # whether the run began with a trained policy
 
     @torch.no_grad()
     def start_from(self, policy: Policy) -> None:
@@ -113,7 +113,6 @@ class Training:
                 own.copy_(theirs)
         self.network_pass.refresh()
         self.obs_moments = policy.moments.followed_by(self.obs_moments).recounted()
-        self.has_start_policy = True
         self.progress = replace(self.progress, learning_rate=self.ppo.learning_rate_min, refitting=True)
 
     @property
@@ -191,11 +190,11 @@ class Training:
             moments = moments.merged(part)
         # No tick until the weights below have changed too: a request then gets a consistent policy.
         self.obs_moments = moments
-        takes_over = self.has_start_policy and before.version == 0
-        if (before.stage_number > 0 or takes_over) and self.curriculum.count_reset == "absorbed":
-            # After a stage change the count starts at 1 again, and the moments jump to those of the next dataset. The
+        was_recounted = before.stage_number > 0 or self.has_start_policy
+        if was_recounted and self.curriculum.count_reset == "absorbed":
+            # After a stage change the count starts at 1 again, and the moments jump to those of the next datasets. The
             # network must not play differently because of it.
-            if takes_over:  # the new critic's own numbers had no moments before
+            if before.version == 0:  # the new critic's own numbers had no moments before
                 frozen = frozen.first(self.network.obs_size).followed_by(moments)
             for network in (self.network, self.average):
                 network.renormalize(frozen, self.obs_moments)
@@ -323,6 +322,7 @@ def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
         frames=config.frames,
     )
     training.group = group
+    training.has_start_policy = bool(config.start_policy)
     if (policy := start_policy(config)) is not None:
         training.start_from(policy)
     return training

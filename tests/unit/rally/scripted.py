@@ -75,7 +75,9 @@ def make_motion(before: Sequence[float], after: Sequence[float]) -> RobotMotion:
         start_pos=start[None],
         joint_pos=(start + share * (np.array(after) - start))[None],
         torque=np.zeros((1, SUBSTEPS, 7)),
-        contact=np.zeros((1, SUBSTEPS, 8))[..., :4],  # of MuJoCo's records too: kernels are compiled for it once
+        contact=np.zeros((1, SUBSTEPS, 8))[
+            ..., :4
+        ],  # of MuJoCo's records too: kernels are compiled for it once
         step=CONTROL_PERIOD / SUBSTEPS,
     )
 
