@@ -8,6 +8,7 @@ LOCK := $(BIN)/uv pip compile pyproject.toml requirements/beside.in --override r
 # of the tests: the cores that this process may use, at most four
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 4 ? 4 : n)))
 STAMP := $(VENV)/.installed
+KERNELS := $(VENV)/.compiled
 MINUTES ?=
 ACTORS ?= 1
 RUN ?=
@@ -20,32 +21,35 @@ OUT ?=
 help:                     ## this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / - /'
 
-install: $(STAMP)         ## make .venv with everything in it, and compile the kernels
+install: $(KERNELS)       ## make .venv with everything in it, and compile the kernels
 
 # the lock names every package but torch, which the second line brings
 $(STAMP): pyproject.toml requirements/dev.lock
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --require-hashes --no-deps --requirement requirements/dev.lock
 	$(PIP) install --no-build-isolation --editable '.[dev]'
-	$(BIN)/python -m topspin.compile_kernels
 	@touch $(STAMP)
 
-train: $(STAMP)           ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
+$(KERNELS): $(STAMP)
+	$(BIN)/python -m topspin.compile_kernels
+	@touch $(KERNELS)
+
+train: $(KERNELS)         ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
 	$(BIN)/topspin train --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
 
-play: $(STAMP)            ## measure a policy and film it: make play [POLICY=folder] [VIDEO=runs/play.mp4]
+play: $(KERNELS)          ## measure a policy and film it: make play [POLICY=folder] [VIDEO=runs/play.mp4]
 	$(BIN)/topspin play $(if $(POLICY),--policy $(POLICY)) $(if $(VIDEO),--video $(VIDEO))
 
-pictures: $(STAMP)        ## draw the README's pictures: make pictures [POLICY=folder] [OUT=docs/pictures]
+pictures: $(KERNELS)      ## draw the README's pictures: make pictures [POLICY=folder] [OUT=docs/pictures]
 	$(BIN)/topspin pictures $(if $(POLICY),--policy $(POLICY)) $(if $(OUT),--out $(OUT))
 
-report: $(STAMP)          ## compare runs: make report RUN="night other" [OUT=runs/report]
+report: $(KERNELS)        ## compare runs: make report RUN="night other" [OUT=runs/report]
 	$(BIN)/topspin report $(RUN) $(if $(OUT),--out $(OUT))
 
-test: $(STAMP)            ## all tests
+test: $(KERNELS)          ## all tests
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test-fast: $(STAMP)       ## unit and contract tests
+test-fast: $(KERNELS)     ## unit and contract tests
 	$(BIN)/python -m pytest tests/unit tests/contract -n $(WORKERS) --dist worksteal
 
 check: $(STAMP)           ## format, lint, types, layers
@@ -58,7 +62,7 @@ fix: $(STAMP)             ## format, and mend what ruff can
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-bench: $(STAMP)           ## the quick benchmarks
+bench: $(KERNELS)         ## the quick benchmarks
 	$(BIN)/python -m benchmarks.startup --json
 	$(BIN)/python -m benchmarks.generator --json
 	$(BIN)/python -m benchmarks.env --json
@@ -68,7 +72,7 @@ bench: $(STAMP)           ## the quick benchmarks
 	$(BIN)/python -m benchmarks.learner --json
 	$(BIN)/python -m benchmarks.system --json
 
-bench-guard: $(STAMP)     ## fail where a part is much slower against its limit than recorded
+bench-guard: $(KERNELS)   ## fail where a part is much slower against its limit than recorded
 	$(BIN)/python -m benchmarks.guard
 
 docs: $(STAMP)            ## the documentation as pages: build/site/index.html
