@@ -68,7 +68,7 @@ PREDICTED = SPIN - PRESENT  # numbers of ``observation.PREDICTION``: present and
 
 SPIN_SIGMA = 50.0  # [rad/s] prior an axis; balls of the preset `paper` have 45
 DRAG_SIGMA = 0.09  # [-] prior of the drag factor: uniform in 0.85..1.15
-MAX_SPIN = 600.0  # [rad/s] bound of the estimate
+MAX_SPIN = 1000.0  # [rad/s] bound of the estimate
 MAX_DRAG_DEVIATION = 0.5  # [-] bound of the estimated drag factor's deviation from 1
 
 # Spin / visible spin of mild and of strong balls, mean and sigma [-]: measured at the bounce of balls of the presets

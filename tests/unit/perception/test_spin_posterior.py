@@ -15,8 +15,14 @@ from common.perception.spin_posterior import (
     flight_information,
     quasi_random,
     spin_after_bounce,
+    stroke_density,
+    stroke_prior,
 )
+from common.physics.flight import FULL, Air
+from common.physics.fly import NO_ROBOT, fly_to_touch
 from common.physics.table_bounce import table_bounce
+from common.task.config import TaskConfig
+from common.task.launch import draw_rallies
 from common.task.launch_presets import KINDS, Kind
 
 UP = (0.0, 0.0, 1.0)
@@ -34,6 +40,21 @@ def in_sphere(count, radius, rng) -> np.ndarray:
     directions = rng.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return radius * rng.random((count, 1)) ** (1 / 3) * directions
+
+
+def strokes(count, rng) -> np.ndarray:
+    """Return spins of players' strokes for a ball of velocity BEFORE."""
+    speed = np.sqrt(31.89)
+    back, top = (
+        0.33 / 0.6 * np.exp(-0.5 * ((speed - 4.8) / 0.6) ** 2),
+        0.67 / 2.9 * np.exp(-0.5 * ((speed - 9.3) / 2.9) ** 2),
+    )
+    is_back = rng.random(count) < back / (back + top)
+    middle = np.where(is_back, -507.0 + 69.5 * speed, 40.0 + 40.0 * speed)
+    topspin = middle + np.where(is_back, 90.0, 180.0) * rng.standard_normal(count)
+    gyro, side = 65.0 * rng.standard_normal(count), 37.0 + 110.0 * rng.standard_normal(count)
+    ex, ey = np.array([-5.0, 0.8]) / np.sqrt(25.64)
+    return np.stack([gyro * ex - topspin * ey, gyro * ey + topspin * ex, side], axis=1)
 
 
 def visible(spins: np.ndarray) -> np.ndarray:
@@ -73,10 +94,10 @@ def reference(spin, mild) -> tuple[np.ndarray, np.ndarray, float]:
     """
     rng = np.random.default_rng(0)
     is_mild = rng.random((BALLS, 1)) < mild
-    spins, frictions = (
-        in_sphere(BALLS, np.where(is_mild, MILD_RADIUS, STRONG_RADIUS), rng),
-        rng.normal(0.25, 0.029, BALLS),
-    )
+    spins = in_sphere(BALLS, np.where(is_mild, 100.0, 300.0), rng)
+    is_stroke = ~is_mild & (rng.random((BALLS, 1)) < 0.5)
+    spins = np.where(is_stroke, strokes(BALLS, rng), spins)
+    frictions = rng.normal(0.25, 0.029, BALLS)
     change, vector, matrix = evidence_of(spin)
     after = np.array(
         [
@@ -101,6 +122,8 @@ CASES = [
     ((-120.0, -40.0, 180.0), STRONG),
     ((20.0, -50.0, 60.0), MIXED),
     ((30.0, -160.0, 120.0), MIXED),
+    ((20.0, -330.0, 60.0), STRONG),  # a player's topspin, which rolls
+    ((-10.0, 220.0, 40.0), STRONG),  # a player's backspin
 ]
 
 
@@ -138,7 +161,7 @@ def test_a_sliding_bounce_gives_the_spins_direction():
 
 
 def test_the_sign_of_the_sidespin_comes_from_the_flight():
-    """Without evidence of the flight both signs are equally probable, and the mean is 0."""
+    """Without evidence of the flight the mean is the prior's: 0 in the sphere, 37 rad/s of players."""
     with_evidence = posterior_mean((0.0, 100.0, 150.0), STRONG, MANY)
     change, vector, matrix = evidence_of((0.0, 100.0, 150.0))
     matrix[2] = [0.0, 0.0, 1e-8]
@@ -148,7 +171,7 @@ def test_the_sign_of_the_sidespin_comes_from_the_flight():
     )
 
     assert with_evidence[2] > 80.0
-    assert abs(hidden[2]) < 15.0
+    assert -10.0 < hidden[2] < 47.0
 
 
 def test_both_kinds_have_the_same_total_density():
@@ -157,6 +180,44 @@ def test_both_kinds_have_the_same_total_density():
 
     shells = 4 * np.pi * rate[:, None] ** 2
     np.testing.assert_allclose((shells * density).sum(axis=0), 4 / 3 * np.pi * STRONG_RADIUS**3, rtol=0.02)
+
+
+def test_the_density_of_strokes_is_that_of_the_balls_drawn_from_it():
+    """In a box around 200 spins of them: as many as the density says."""
+    rng = np.random.default_rng(3)
+    drawn, prior, unit = strokes(BALLS, rng), stroke_prior(BEFORE), 4 / 3 * np.pi * 300.0**3
+    half = 40.0
+    for centre in drawn[:200]:
+        inside = (np.abs(drawn - centre) < half).all(axis=1).sum()
+        around = centre + rng.uniform(-half, half, (200, 3))
+        expected = np.mean([stroke_density(prior, *w) for w in around]) / unit * (2 * half) ** 3 * BALLS
+        assert abs(inside - expected) < 5.0 * np.sqrt(expected) + 0.05 * expected + 5.0
+
+
+def test_strokes_are_those_of_the_preset_match_at_their_bounce():
+    rallies = draw_rallies(1500, TaskConfig.model_validate({"launch": "match"}), seed=4)
+    topspins, speeds, others = [], [], []
+    for launch in rallies.launches:
+        _, v, *_ = fly_to_touch(
+            *map(tuple, launch[:9].reshape(3, 3)), 1.0, Air(*launch[9:11], FULL), NO_ROBOT
+        )
+        ex, ey = v[0] / np.hypot(v[0], v[1]), v[1] / np.hypot(v[0], v[1])
+        wx, wy, wz = launch[6:9]
+        topspins.append(wy * ex - wx * ey)
+        speeds.append(np.linalg.norm(v))
+        others.append((wz, wx * ex + wy * ey))
+    topspins, speeds, others = map(np.array, (topspins, speeds, others))
+    back, fast = topspins < 0.0, speeds > 7.5  # so fast a ball has no backspin
+
+    assert back.mean() == pytest.approx(0.33, abs=0.06)
+    assert (back & fast).mean() < 0.01
+    off = topspins[fast] - (40.0 + 40.0 * speeds[fast])
+    assert abs(off.mean()) < 35.0
+    assert off.std() == pytest.approx(180.0, abs=40.0)
+    assert speeds[back].mean() == pytest.approx(4.8, abs=0.3)
+    assert abs((topspins[back] - (-507.0 + 69.5 * speeds[back])).mean()) < 35.0
+    np.testing.assert_allclose(others.mean(axis=0), [37.0, 0.0], atol=20.0)
+    np.testing.assert_allclose(others.std(axis=0), [110.0, 65.0], atol=15.0)
 
 
 def test_the_flights_information_is_the_estimate_without_its_prior_widened_by_the_lift_factor():
