@@ -3,9 +3,9 @@
     python -m benchmarks.scaling --json                          # measures the costs first: about a minute
     python -m benchmarks.scaling --save costs.json               # ... and keeps them
     python -m benchmarks.scaling --costs costs.json --cores 64,512 --json
-    python -m benchmarks.scaling --costs costs.json --validate   # real runs too: three minutes
+    python -m benchmarks.scaling --costs costs.json --validate   # real runs too: four minutes more
 
-Costs of every part are measured in one process and on one machine. A simulation in virtual time, with the program's own
+Costs of every part are measured on one machine, as CPU time. A simulation in virtual time, with the program's own
 pacing, turns them into frames/s of a run with any number of actors and learners. The best split that a small search
 finds is printed, and the part whose doubled speed would help it most. Minutes come from a law of how many frames a
 training needs with datasets of that size, fitted to measured trainings in ``results/large_batches.json``. Without that
@@ -13,6 +13,7 @@ file there are frames/s and bounds only.
 """
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -59,16 +60,17 @@ class ScalingConfig(BenchmarkConfig):
         json_schema_extra={"unit": "us"},
     )
     part_seconds: float = Field(
-        2.0, gt=0, description="measurement of each part's costs", json_schema_extra={"unit": "s"}
+        1.0, gt=0, description="measurement of each part's costs", json_schema_extra={"unit": "s"}
     )
     seed: int = Field(0, ge=0, lt=2**63, description="of all random numbers of the costs")
     validate_runs: bool = Field(
         False, alias="validate", description="compare predictions with short real runs on this machine"
     )
     warm_up: float = Field(
-        10.0,
+        25.0,
         ge=0,
-        description="of a real run, from its first trained dataset",
+        description="of a real run, from its first trained dataset; a spare actor, which starts 10 s after the others, "
+        "takes a core for several seconds of it",
         json_schema_extra={"unit": "s"},
     )
     seconds: float = Field(
@@ -106,7 +108,8 @@ def main(config: ScalingConfig, stop: Event) -> int:
     table(compared)
     if config.json_line:
         figures = {"machine": found.machine, "predictions": rows, "validation": compared}
-        print(json.dumps(figures | {"learning": learning(law), "costs": found.model_dump()}))
+        goal = measured.model_dump(exclude={"points"}) if measured else None
+        print(json.dumps(figures | {"goal": goal, "learning": learning(law), "costs": found.model_dump()}))
     return DONE
 
 
@@ -142,7 +145,7 @@ def said_of_learning(law: FramesToGoal | None, file: str) -> str:
     missed = f", {law.missed} missed it and do not count" if law.missed else ""
     return (
         f"{law.least / 1e6:.1f} M frames (1 + D / {law.noise:,.0f}) to the goal with datasets of D frames, times or "
-        f"divided by {2.718281828**law.spread:.2f}, from {law.reached} trainings{missed}"
+        f"divided by {math.exp(law.spread):.2f}, from {law.reached} trainings{missed}"
     )
 
 
@@ -164,6 +167,7 @@ def row(found: Prediction) -> dict[str, Any]:
         "learner_busy": round(result.learner_busy, 3),
         "exchange": round(result.exchange, 3),
         "hub_busy": round(result.hub_busy, 3),
+        "cores_used": round(result.cores_used, 1),
         "lag": round(result.lag, 2),
         "refused": result.refused,
         "rollout_mb_per_s": round(found.bytes_per_s / 1e6, 1),

@@ -57,6 +57,7 @@ class Machine:
             raise ValueError(f"cores {cores}, slowdown {slowdown}; allowed: above 0, and from 1")
         self._cores, self._slowdown = cores, slowdown
         self.now = 0.0  # [s]
+        self.used = 0.0  # [s] CPU time of all cores so far
         # Work that one process has been given since the beginning [s]. All working processes are given the same, so
         # a piece of work ends where this has grown by its seconds, however many come and go meanwhile.
         self._given = 0.0
@@ -97,6 +98,7 @@ class Machine:
             alarm = self._alarms[0][0] if self._alarms else math.inf
             if math.isinf(min(done, alarm)):
                 raise RuntimeError("every process waits, and nothing will wake one")
+            self.used += (min(done, alarm) - self.now) * min(float(len(self._working)), self._cores)
             if done <= alarm:
                 self.now = max(done, self.now)
                 self._given, _, process = heapq.heappop(self._working)

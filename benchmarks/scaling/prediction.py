@@ -20,7 +20,6 @@ FEWEST, MOST = 6, 40  # splits that are simulated shortly: those that the estima
 EVENTS_OF_SEARCH: Final = 4000  # cores times these splits: a large fleet takes a second each
 FINALISTS: Final = 4  # splits that are simulated for longer: the best of those
 STEPS: Final = 4  # gradient steps of a pass, as the default has: a minibatch is a quarter of a dataset
-PROCESSES: Final = 2  # besides actors and learners: generator, evaluator
 SHORT, LONG = (3, 4), (8, 24)  # datasets of a simulation: before its measurement, and in it
 EVENTS_OF_RUN: Final = 6000  # datasets of a large fleet are many events each, and are all alike
 TWICE: Final = 2.0
@@ -186,9 +185,11 @@ def estimate(plan: Plan, setting: Setting) -> float:
 
 
 def start_s(plan: Plan, costs: Costs) -> float:
-    """Return the time from the start to the first rollout [s]: processes start at once, and share the cores."""
-    processes = plan.actors + plan.learners + PROCESSES
-    return costs.start_s * max(1.0, processes / plan.cores)
+    """Return the time from the start of the processes to the first rollout [s]: all start at once, and share the cores.
+
+    Generators start sooner than the others, and the evaluator gives way.
+    """
+    return costs.start_s * max(1.0, (plan.actors + plan.learners) / plan.cores)
 
 
 def duration(plan: Plan, setting: Setting, frames_per_s: float) -> float:

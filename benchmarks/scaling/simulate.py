@@ -57,6 +57,7 @@ class Result:
     )
     exchange: float  # share of the time in which all learners wait for numbers under way
     hub_busy: float  # share of the time in which the hub has work
+    cores_used: float  # by learners, actors and the hub
     lag: float  # versions, mean over rollouts
     refused: int  # rollouts that were not accepted, or lost
     datasets: int  # that were measured
@@ -130,7 +131,7 @@ class _Run:
     def measured(self, warm_up: int, datasets: int) -> Result:
         self._until(warm_up)
         start, before, refused = self.machine.now, self._busy(), self.refused
-        training, exchanging = self.training, self.exchanging
+        training, exchanging, used = self.training, self.exchanging, self.machine.used
         self._until(warm_up + datasets)
         span = self.machine.now - start
         playing, hub = (now - then for now, then in zip(self._busy(), before, strict=True))
@@ -140,6 +141,7 @@ class _Run:
             learner_busy=(self.training - training) / span,
             exchange=(self.exchanging - exchanging) / span,
             hub_busy=hub / span,
+            cores_used=(self.machine.used - used) / span,
             lag=float(np.mean(self.lags[warm_up:])),
             refused=self.refused - refused,
             datasets=datasets,

@@ -69,6 +69,13 @@ def test_an_actor_and_a_learner_with_a_core_each_go_as_fast_as_the_slower(step_s
     assert found == pytest.approx(expected, rel=1e-6)
 
 
+def test_the_cores_that_are_used_are_the_work_in_a_second():
+    result = simulate(Plan(cores=4, actors=1), costs())
+
+    assert result.cores_used == pytest.approx((0.3 + 0.16384) / 0.3)
+    assert (result.actor_busy, result.learner_busy) == pytest.approx((1.0, 0.16384 / 0.3))
+
+
 def test_on_one_core_the_costs_add_up():
     assert rate(Plan(cores=1, actors=1), costs()) == pytest.approx(8192 / (0.3 + 0.16384), rel=1e-6)
 
