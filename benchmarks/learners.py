@@ -59,7 +59,7 @@ def _rank(
         started = time.perf_counter()
         frames += training.run_epoch(rollouts).frames
         mine = np.array([time.perf_counter() - started])
-        taken += float(max(times[0] for times in group.gathered(mine)))
+        taken += float(max(times[0] for (times,) in group.gathered(mine)))
     parameters = np.concatenate([p.detach().numpy().ravel() for p in training.network.parameters()])
     results.send((frames / taken if taken else 0.0, parameters))
     group.leave()

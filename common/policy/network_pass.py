@@ -20,6 +20,7 @@ Precision = Literal["float32", "bfloat16"]
 SIZE_STEP: Final = (
     64  # rows of products whose batch is not a full one: each new shape costs a compilation of its product
 )
+LINE: Final = 64  # [bytes] of a cache line
 DTYPES: Final[dict[Precision, torch.dtype]] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -37,6 +38,8 @@ def _bits(tensor: Tensor) -> npt.NDArray[Any]:
 class _Layer:
     """A linear layer with arrays of its own: inputs [hidden, observation, 1], outputs, and their gradients.
 
+    Rows of inputs and weights begin at a cache line; the numbers that fill them up are zero.
+
     Args:
         linear: Its parameters.
         observed: How many numbers of the observation it takes after the hidden ones.
@@ -45,21 +48,21 @@ class _Layer:
     """
 
     def __init__(self, linear: nn.Linear, observed: int, rows: int, dtype: torch.dtype) -> None:
-        self.linear = linear
         self.observed = observed
         self.hidden = linear.in_features - observed
-        self.weights = torch.empty((linear.out_features, linear.in_features + 1), dtype=dtype)
-        self.inputs = torch.ones((rows, linear.in_features + 1), dtype=dtype)
-        self.outputs = torch.zeros((rows, linear.out_features), dtype=dtype)
-        self.slope = torch.empty_like(self.outputs)  # of the loss, with respect to the outputs
+        bias = linear.in_features
+        width = -(-(bias + 1) // (LINE // dtype.itemsize)) * (LINE // dtype.itemsize)
+        self.weights, self.gradient = (torch.zeros((linear.out_features, width), dtype=dtype) for _ in "wg")
+        self.inputs = torch.zeros((rows, width), dtype=dtype)
+        self.inputs[:, bias] = 1.0
+        self.outputs, self.slope = (torch.zeros((rows, linear.out_features), dtype=dtype) for _ in "os")
         self.input_bits, self.output_bits, self.slope_bits = map(
             _bits, (self.inputs, self.outputs, self.slope)
         )
-
-    def cast(self) -> None:
-        """Take the parameters as they are now."""
-        self.weights[:, :-1].copy_(self.linear.weight)
-        self.weights[:, -1].copy_(self.linear.bias)
+        # The parameters, and where the products have them and their gradients
+        self.parameters = [linear.weight, linear.bias]
+        self.places = [self.weights[:, :bias], self.weights[:, bias]]
+        self.slopes = [self.gradient[:, :bias], self.gradient[:, bias]]
 
     def take(self, obs: Tensor) -> None:
         """Take the observations (n, ...) of a batch."""
@@ -71,10 +74,8 @@ class _Layer:
         return torch.mm(self.inputs[:count], self.weights.t(), out=self.outputs[:count])
 
     def backward(self, count: int) -> None:
-        """Set the parameters' gradients, given the outputs' slope."""
-        gradient = torch.mm(self.slope[:count].t(), self.inputs[:count])
-        for parameter, part in ((self.linear.weight, gradient[:, :-1]), (self.linear.bias, gradient[:, -1])):
-            parameter.grad = torch.empty_like(parameter).copy_(part)
+        """Compute the parameters' gradients, given the outputs' slope."""
+        torch.mm(self.slope[:count].t(), self.inputs[:count], out=self.gradient)
 
     def hidden_slope(self, count: int) -> Tensor:
         """Return the slope with respect to the hidden inputs (count, hidden)."""
@@ -85,7 +86,7 @@ class NetworkPass:
     """Forward and backward pass of one network over batches of up to ``rows`` observations.
 
     Args:
-        network: ``refresh`` reads its parameters; ``backward`` sets their ``grad``.
+        network: ``refresh`` reads its parameters; ``backward`` writes the gradient that ``gradient_of`` returns.
         rows: Largest batch.
         precision: Of the products, and of the numbers between layers.
     """
@@ -106,17 +107,43 @@ class NetworkPass:
         beyond_trunk = linears[0].in_features - network.trunk.out_features if linears else 0
         self._critic = [layer(linear, 0 if k else beyond_trunk) for k, linear in enumerate(linears)]
         self._mean, self._value = layer(network.mean), layer(network.value)
+        policy, critic = [*self._trunk, self._mean], [*self._critic, self._value]
+        layers = policy + critic
+        self._parameters = [parameter for layer in layers for parameter in layer.parameters]
+        self._places = [place for layer in layers for place in layer.places]
+        self._slopes = [slope for layer in layers for slope in layer.slopes]
+        self._policy_tensors = 2 * len(policy)
+        # One array holds all gradients: the noise's, the policy's, the critic's
+        self._learning = [network.log_std, *self._parameters]
+        sizes = [parameter.numel() for parameter in self._learning]
+        self._gradient = torch.zeros(sum(sizes))
+        parts = torch.split(self._gradient, sizes)
+        self._gradients = [part.view_as(of) for part, of in zip(parts, self._learning, strict=True)]
         self._count = 0  # observations of the last forward pass
         self._size = (
             0  # rows of its products: the observations, and rows of earlier batches that nobody reads
         )
         self.refresh()
 
+    def gradient_of(self, learns_policy: bool, learns_noise: bool) -> tuple[Tensor, Tensor]:
+        """Return the gradient of what learns (P,), and the noise's part of it: (A,), or (0,) if that does not learn.
+
+        The parameters' ``grad`` are views of it from now on, and None where they do not learn.
+
+        Args:
+            learns_policy: Whether the policy learns, and not the critic alone.
+            learns_noise: Whether the log standard deviation learns too.
+        """
+        first = 0 if learns_noise else 1 if learns_policy else 1 + self._policy_tensors
+        for index, (parameter, gradient) in enumerate(zip(self._learning, self._gradients, strict=True)):
+            parameter.grad = gradient if index >= first else None
+        start = sum(gradient.numel() for gradient in self._gradients[:first])
+        return self._gradient[start:], self._gradients[0] if learns_noise else torch.zeros(0)
+
     @torch.no_grad()
     def refresh(self) -> None:
         """Take the network's parameters as they are now; call it whenever they have changed."""
-        for layer in (*self._trunk, self._mean, *self._critic, self._value):
-            layer.cast()
+        torch._foreach_copy_(self._places, self._parameters)
 
     @torch.no_grad()
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -171,7 +198,7 @@ class NetworkPass:
 
     @torch.no_grad()
     def backward(self, mean: Tensor | None, value: Tensor | None) -> None:
-        """Set the gradients of the parameters for the last ``forward``; ``log_std`` is not one of its.
+        """Write the gradient of the parameters for the last ``forward``; ``log_std`` is not one of its.
 
         Args:
             mean: Slope of the loss with respect to the mean actions (n, A); None: only the critic's own layers learn.
@@ -181,18 +208,19 @@ class NetworkPass:
         self._value.slope[:count, 0] = 0.0 if value is None else value
         self._value.slope[count:size] = 0.0
         slope = self._back([*self._critic, self._value], size, is_needed=mean is not None)
-        if mean is None:
-            return
-        self._mean.slope[:count] = mean
-        self._mean.slope[count:size] = 0.0
-        self._mean.backward(size)
-        last = self._trunk[-1]
-        torch.add(slope, self._mean.hidden_slope(size), out=last.slope[:size])
-        elu_gradient(self._mean.input_bits, last.slope_bits[:size])
-        self._back(self._trunk, size, is_needed=False)
+        if mean is not None:
+            self._mean.slope[:count] = mean
+            self._mean.slope[count:size] = 0.0
+            self._mean.backward(size)
+            last = self._trunk[-1]
+            torch.add(slope, self._mean.hidden_slope(size), out=last.slope[:size])
+            elu_gradient(self._mean.input_bits, last.slope_bits[:size])
+            self._back(self._trunk, size, is_needed=False)
+        first = self._policy_tensors if mean is None else 0
+        torch._foreach_copy_(self._gradients[1 + first :], self._slopes[first:])
 
     def _back(self, layers: list[_Layer], count: int, is_needed: bool) -> Tensor:
-        """Set the gradients of layers with ELU between them; return the slope of the first one's hidden inputs."""
+        """Compute the gradients of layers with ELU between them; return the slope of the first one's hidden inputs."""
         for before, layer in reversed(list(pairwise(layers))):
             layer.backward(count)
             torch.mm(layer.slope[:count], layer.weights[:, : layer.hidden], out=before.slope[:count])
