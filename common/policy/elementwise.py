@@ -58,10 +58,9 @@ _rounded: Any = intrinsic(_rounded_code)
 
 
 @kernel
-def elu(inputs: Any, outputs: Any) -> None:
-    """Write ELU of ``inputs`` (N, n) into the first n columns of ``outputs`` (N, n or more)."""
-    count, width = inputs.shape
-    for i in range(count):
+def elu(inputs: Any, outputs: Any, width: int) -> None:
+    """Write ELU of the first ``width`` columns of ``inputs`` (N, ...) into those of ``outputs`` (N or more, ...)."""
+    for i in range(len(inputs)):
         source, target = inputs[i], outputs[i]
         for j in range(width):
             x = _as_float32(source[j])
@@ -74,10 +73,9 @@ def elu(inputs: Any, outputs: Any) -> None:
 
 
 @kernel
-def elu_gradient(outputs: Any, gradient: Any) -> None:
-    """Multiply ``gradient`` (N, n) by ELU's slope, given its outputs: the first n columns of ``outputs``."""
-    count, width = gradient.shape
-    for i in range(count):
+def elu_gradient(outputs: Any, gradient: Any, width: int) -> None:
+    """Multiply the first ``width`` columns of ``gradient`` (N, ...) by ELU's slope, given those of its outputs."""
+    for i in range(len(gradient)):
         y, g = outputs[i], gradient[i]
         for j in range(width):
             slope = min(_as_float32(y[j]), _0) + _1
