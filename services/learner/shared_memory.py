@@ -49,7 +49,7 @@ class SharedMemoryLinks:
     def __init__(self, rank: int, size: int, file: Path, timeout_s: float) -> None:
         self._rank, self._size = rank, size
         self._sockets = _meet(rank, size, file, timeout_s)
-        memory = _share(rank, self._sockets, 2 * size * MAILBOX, file.parent)
+        memory = _share(rank, self._sockets, 2 * size * MAILBOX)
         mailboxes = np.frombuffer(memory, np.uint8).reshape(2, size, MAILBOX)
         self._left = mailboxes[..., :8].view(np.int64)[..., 0]  # (2, size) bytes from this piece on
         self._boxes = mailboxes[..., HEADER:]  # (2, size, ROOM)
@@ -166,16 +166,23 @@ def _call(door: Path, timeout_s: float) -> socket.socket:
         return link
 
 
-def _share(rank: int, links: dict[int, socket.socket], size: int, folder: Path) -> mmap.mmap:
+def _share(rank: int, links: dict[int, socket.socket], size: int) -> mmap.mmap:
     """Return ``size`` bytes of memory that all ranks have: a file without a name, which the first one makes."""
     if rank == 0:
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.truncate(size)
-            for link in links.values():
-                socket.send_fds(link, [b"."], [file.fileno()])
-            return mmap.mmap(file.fileno(), size)
-    _, (descriptor,), *_ = socket.recv_fds(links[0], 1, 1)
+        # In memory where the system can; a file on a disk would be written back again and again
+        file = os.memfd_create("topspin") if hasattr(os, "memfd_create") else _nameless_file()
+        os.truncate(file, size)
+        for link in links.values():
+            socket.send_fds(link, [b"."], [file])
+    else:
+        _, (file,), *_ = socket.recv_fds(links[0], 1, 1)
     try:
-        return mmap.mmap(descriptor, size)
+        return mmap.mmap(file, size)
     finally:
-        os.close(descriptor)
+        os.close(file)
+
+
+def _nameless_file() -> int:
+    """Return the descriptor of a file that no folder has."""
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
