@@ -64,7 +64,9 @@ def _fma_code(_typing: Any, a: Any, b: Any, c: Any) -> Any:
 
 _as_float32: Any = intrinsic(_as_float32_code)
 _rounded: Any = intrinsic(_rounded_code)
-_fma: Any = intrinsic(_fma_code)  # one instruction on every CPU since 2013; written out, so that bits do not depend on it
+_fma: Any = intrinsic(
+    _fma_code
+)  # one instruction on every CPU since 2013; written out, so that bits do not depend on it
 
 
 @kernel

@@ -18,9 +18,8 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.elementwise import elu, elu_gradient, place
 
 Precision = Literal["float32", "bfloat16"]
-SIZE_STEP: Final = (
-    64  # rows of products whose batch is not a full one: each new shape costs a compilation of its product
-)
+# Rows of products whose batch is not a full one: each new shape costs a compilation of its product
+SIZE_STEP: Final = 64
 LINE: Final = 64  # [bytes] of a cache line
 DTYPES: Final[dict[Precision, torch.dtype]] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
@@ -164,9 +163,8 @@ class NetworkPass:
         split = torch.split(self._gradient, sizes)
         self._gradients = [part.view_as(of) for part, of in zip(split, self._learning, strict=True)]
         self._count = 0  # observations of the last forward pass
-        self._size = (
-            0  # rows of its products: the observations, and rows of earlier batches that nobody reads
-        )
+        # Rows of its products: the observations, and rows of earlier batches that nobody reads
+        self._size = 0
         self.refresh()
 
     def gradient_of(self, learns_policy: bool, learns_noise: bool) -> tuple[Tensor, Tensor]:
