@@ -81,13 +81,10 @@ class _Layer:
         self._weights_transposed, self._hidden_weights = self._weights.t(), self._weights[:, : self.hidden]
         self._rows: dict[int, _Rows] = {}
         sizes = [linear.out_features for linear in linears]
+        places, slopes = (torch.split(of, sizes) for of in (self._weights, self._gradient))
         self.parts = [
             _Part((linear.weight, linear.bias), *((of[:, : linear.in_features], of[:, bias]) for of in both))
-            for linear, both in zip(
-                linears,
-                zip(self._weights.split(sizes), self._gradient.split(sizes), strict=True),
-                strict=True,
-            )
+            for linear, *both in zip(linears, places, slopes, strict=True)
         ]
 
     def first(self, count: int) -> _Rows:
