@@ -24,8 +24,7 @@ OTHERS_END_S: Final = 15.0  # time of the others to notice that one is lost
 
 def environment_of(rank: int, ranks: int, file: Path, own: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the environment that tells a learner its rank, and how it finds the others: on this machine only."""
-    where = {"GROUP_FILE": str(file), "GLOO_SOCKET_IFNAME": "lo"}
-    return {**own, **where, "RANK": str(rank), "WORLD_SIZE": str(ranks)}
+    return {**own, "GROUP_FILE": str(file), "RANK": str(rank), "WORLD_SIZE": str(ranks)}
 
 
 def start(ranks: int, logs: Path, flags: Sequence[str], file: Path) -> list[subprocess.Popen[bytes]]:

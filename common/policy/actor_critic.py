@@ -113,10 +113,3 @@ def log_prob(actions: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 def entropy(log_std: Tensor) -> Tensor:
     """Return the Gaussian's differential entropy [nats]."""
     return log_std.sum() + 0.5 * log_std.shape[-1] * (1.0 + LOG_2_PI)
-
-
-def kl_divergence(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Tensor) -> Tensor:
-    """Return KL(p || q) of two diagonal Gaussians, averaged over the batch."""
-    variance_q = torch.exp(2.0 * log_std_q)
-    spread = (torch.exp(2.0 * log_std_p) + (mean_p - mean_q) ** 2) / (2.0 * variance_q)
-    return (log_std_q - log_std_p + spread - 0.5).sum(-1).mean()

@@ -53,35 +53,45 @@ def _rounded_code(_typing: Any, value: Any, like: Any) -> Any:
     return like(value, like), code
 
 
+def _fma_code(_typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return a b + c of float32s, rounded once."""
+
+    def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float32(types.float32, types.float32, types.float32), code
+
+
 _as_float32: Any = intrinsic(_as_float32_code)
 _rounded: Any = intrinsic(_rounded_code)
+_fma: Any = intrinsic(
+    _fma_code
+)  # one instruction on every CPU since 2013; written out, so that bits do not depend on it
 
 
 @kernel
-def elu(inputs: Any, outputs: Any) -> None:
-    """Write ELU of ``inputs`` (N, n) into the first n columns of ``outputs`` (N, n or more)."""
-    count, width = inputs.shape
-    for i in range(count):
+def elu(inputs: Any, outputs: Any, width: int) -> None:
+    """Write ELU of the first ``width`` columns of ``inputs`` (N, ...) into those of ``outputs`` (N or more, ...)."""
+    for i in range(len(inputs)):
         source, target = inputs[i], outputs[i]
         for j in range(width):
             x = _as_float32(source[j])
             scaled = max(min(x, _0), _LOWEST) * _LOG2_E
             whole = np.floor(scaled + _HALF)
             r, power = scaled - whole, power_of_2(whole)
-            rest = ((((_C5 * r + _C4) * r + _C3) * r + _C2) * r + _C1) * r + _C0
-            y = rest * r * power + (power - _1)  # exp(x) - 1, without loss of digits near 0
+            rest = _fma(_fma(_fma(_fma(_fma(_C5, r, _C4), r, _C3), r, _C2), r, _C1), r, _C0)
+            y = _fma(rest * r, power, power - _1)  # exp(x) - 1, without loss of digits near 0
             target[j] = _rounded(x if x > _0 else y, source[j])
 
 
 @kernel
-def elu_gradient(outputs: Any, gradient: Any) -> None:
-    """Multiply ``gradient`` (N, n) by ELU's slope, given its outputs: the first n columns of ``outputs``."""
-    count, width = gradient.shape
-    for i in range(count):
+def elu_gradient(outputs: Any, gradient: Any, width: int) -> None:
+    """Multiply the first ``width`` columns of ``gradient`` (N, ...) by ELU's slope, given those of its outputs."""
+    for i in range(len(gradient)):
         y, g = outputs[i], gradient[i]
         for j in range(width):
-            slope = min(_as_float32(y[j]), _0) + _1
-            g[j] = _rounded(_as_float32(g[j]) * slope, g[j])
+            slope = _as_float32(g[j])
+            g[j] = _rounded(_fma(min(_as_float32(y[j]), _0), slope, slope), g[j])
 
 
 @kernel

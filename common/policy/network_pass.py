@@ -6,8 +6,9 @@ its output into the next layer's input, so that nothing is concatenated; the col
 the weights. Weights are cast once a gradient step. The gradient with respect to observations is not computed.
 """
 
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy.typing as npt
 import torch
@@ -17,9 +18,9 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.elementwise import elu, elu_gradient, place
 
 Precision = Literal["float32", "bfloat16"]
-SIZE_STEP: Final = (
-    64  # rows of products whose batch is not a full one: each new shape costs a compilation of its product
-)
+# Rows of products whose batch is not a full one: each new shape costs a compilation of its product
+SIZE_STEP: Final = 64
+LINE: Final = 64  # [bytes] of a cache line
 DTYPES: Final[dict[Precision, torch.dtype]] = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -34,58 +35,95 @@ def _bits(tensor: Tensor) -> npt.NDArray[Any]:
     return (tensor.view(torch.uint16) if tensor.dtype is torch.bfloat16 else tensor).numpy()
 
 
+class _Rows(NamedTuple):
+    """Views of a layer's first rows, as its products and kernels take them."""
+
+    inputs: Tensor  # (n, K)
+    outputs: Tensor  # (n, N)
+    slope: Tensor  # (n, N)
+    slope_transposed: Tensor  # (N, n)
+    output_bits: npt.NDArray[Any]
+    slope_bits: npt.NDArray[Any]
+
+
+class _Part(NamedTuple):
+    """A linear layer's weight and bias, where the products have them, and where they leave the gradients."""
+
+    parameters: tuple[Tensor, Tensor]
+    places: tuple[Tensor, Tensor]
+    slopes: tuple[Tensor, Tensor]
+
+
 class _Layer:
-    """A linear layer with arrays of its own: inputs [hidden, observation, 1], outputs, and their gradients.
+    """Linear layers of the same inputs, with arrays of their own: inputs [hidden, observation, 1], outputs, gradients.
+
+    Rows of inputs and weights begin at a cache line. What fills them up is zero, as are the weights of a linear layer
+    that does not take the observation.
 
     Args:
-        linear: Its parameters.
-        observed: How many numbers of the observation it takes after the hidden ones.
+        linears: Their parameters.
+        observed: How many numbers of the observation the first of them takes after the hidden ones.
         rows: Largest batch.
         dtype: Of its products.
     """
 
-    def __init__(self, linear: nn.Linear, observed: int, rows: int, dtype: torch.dtype) -> None:
-        self.linear = linear
+    def __init__(self, linears: Sequence[nn.Linear], observed: int, rows: int, dtype: torch.dtype) -> None:
         self.observed = observed
-        self.hidden = linear.in_features - observed
-        self.weights = torch.empty((linear.out_features, linear.in_features + 1), dtype=dtype)
-        self.inputs = torch.ones((rows, linear.in_features + 1), dtype=dtype)
-        self.outputs = torch.zeros((rows, linear.out_features), dtype=dtype)
-        self.slope = torch.empty_like(self.outputs)  # of the loss, with respect to the outputs
-        self.input_bits, self.output_bits, self.slope_bits = map(
-            _bits, (self.inputs, self.outputs, self.slope)
-        )
+        bias = linears[0].in_features
+        self.hidden = bias - observed
+        step = LINE // dtype.itemsize
+        width, size = -(-(bias + 1) // step) * step, sum(linear.out_features for linear in linears)
+        self._weights, self._gradient = (torch.zeros((size, width), dtype=dtype) for _ in range(2))
+        self._inputs = torch.zeros((rows, width), dtype=dtype)
+        self._inputs[:, bias] = 1.0
+        self._outputs, self._slope = (torch.zeros((rows, size), dtype=dtype) for _ in range(2))
+        self.input_bits = _bits(self._inputs)
+        self._weights_transposed, self._hidden_weights = self._weights.t(), self._weights[:, : self.hidden]
+        self._rows: dict[int, _Rows] = {}
+        sizes = [linear.out_features for linear in linears]
+        places, slopes = (torch.split(of, sizes) for of in (self._weights, self._gradient))
+        self.parts = [
+            _Part((linear.weight, linear.bias), *((of[:, : linear.in_features], of[:, bias]) for of in both))
+            for linear, *both in zip(linears, places, slopes, strict=True)
+        ]
 
-    def cast(self) -> None:
-        """Take the parameters as they are now."""
-        self.weights[:, :-1].copy_(self.linear.weight)
-        self.weights[:, -1].copy_(self.linear.bias)
+    def first(self, count: int) -> _Rows:
+        """Return the first ``count`` rows."""
+        if count not in self._rows:
+            inputs, outputs, slope = (of[:count] for of in (self._inputs, self._outputs, self._slope))
+            self._rows[count] = _Rows(inputs, outputs, slope, slope.t(), _bits(outputs), _bits(slope))
+        return self._rows[count]
 
-    def take(self, obs: Tensor) -> None:
+    def take(self, bits: npt.NDArray[Any]) -> None:
         """Take the observations (n, ...) of a batch."""
         if self.observed:
-            place(_bits(obs), self.observed, self.input_bits, self.hidden)
+            place(bits, self.observed, self.input_bits, self.hidden)
 
-    def forward(self, count: int) -> Tensor:
-        """Return the outputs (count, n) of the first ``count`` inputs."""
-        return torch.mm(self.inputs[:count], self.weights.t(), out=self.outputs[:count])
+    def forward(self, count: int) -> _Rows:
+        """Compute the outputs of the first ``count`` inputs."""
+        rows = self.first(count)
+        torch.mm(rows.inputs, self._weights_transposed, out=rows.outputs)
+        return rows
+
+    def last_outputs(self, count: int, size: int) -> Tensor:
+        """Return the last ``size`` outputs alone (count, size)."""
+        return torch.mm(self.first(count).inputs, self._weights[-size:].t())
 
     def backward(self, count: int) -> None:
-        """Set the parameters' gradients, given the outputs' slope."""
-        gradient = torch.mm(self.slope[:count].t(), self.inputs[:count])
-        for parameter, part in ((self.linear.weight, gradient[:, :-1]), (self.linear.bias, gradient[:, -1])):
-            parameter.grad = torch.empty_like(parameter).copy_(part)
+        """Compute the parameters' gradients, given the outputs' slope."""
+        rows = self.first(count)
+        torch.mm(rows.slope_transposed, rows.inputs, out=self._gradient)
 
-    def hidden_slope(self, count: int) -> Tensor:
-        """Return the slope with respect to the hidden inputs (count, hidden)."""
-        return torch.mm(self.slope[:count], self.weights[:, : self.hidden])
+    def backward_hidden(self, count: int, out: Tensor) -> None:
+        """Write the slope with respect to the hidden inputs (count, hidden)."""
+        torch.mm(self.first(count).slope, self._hidden_weights, out=out)
 
 
 class NetworkPass:
     """Forward and backward pass of one network over batches of up to ``rows`` observations.
 
     Args:
-        network: ``refresh`` reads its parameters; ``backward`` sets their ``grad``.
+        network: ``refresh`` reads its parameters; ``backward`` writes the gradient that ``gradient_of`` returns.
         rows: Largest batch.
         precision: Of the products, and of the numbers between layers.
     """
@@ -94,29 +132,57 @@ class NetworkPass:
         self.network = network
         self.rows = rows
         self.dtype = DTYPES[precision]
-
-        def layer(linear: nn.Module, observed: int = 0) -> _Layer:
-            if not isinstance(linear, nn.Linear):
-                raise TypeError(f"{type(linear).__name__} as a layer; allowed: Linear")
-            return _Layer(linear, observed, rows, self.dtype)
-
-        self._trunk = [layer(linear, network.obs_size) for linear in network.trunk.layers]
+        self._actions = network.mean.out_features
         head = network.critic_head
-        linears = [] if head is None else [part for part in head if isinstance(part, nn.Linear)]
-        beyond_trunk = linears[0].in_features - network.trunk.out_features if linears else 0
-        self._critic = [layer(linear, 0 if k else beyond_trunk) for k, linear in enumerate(linears)]
-        self._mean, self._value = layer(network.mean), layer(network.value)
-        self._count = 0  # observations of the last forward pass
-        self._size = (
-            0  # rows of its products: the observations, and rows of earlier batches that nobody reads
+        critic = [part for part in head or [] if isinstance(part, nn.Linear)] + [network.value]
+        trunk = [
+            _Layer([linear], network.obs_size, rows, self.dtype) for linear in _linears(network.trunk.layers)
+        ]
+        # The critic's first layer and the mean actions take the trunk's outputs, and are one product
+        beyond_trunk = critic[0].in_features - network.trunk.out_features
+        self._heads = _Layer([critic[0], network.mean], beyond_trunk, rows, self.dtype)
+        self._trunk = [*trunk, self._heads]
+        self._critic = [self._heads, *(_Layer([linear], 0, rows, self.dtype) for linear in critic[1:])]
+        self._layers = [*trunk, *self._critic]
+        parts = {id(part.parameters[0]): part for layer in self._layers for part in layer.parts}
+        policy, critics = (
+            [parts[id(linear.weight)] for linear in linears]
+            for linears in ([*_linears(network.trunk.layers), network.mean], critic)
         )
+        self._parameters = [parameter for part in policy + critics for parameter in part.parameters]
+        self._places = [place for part in policy + critics for place in part.places]
+        self._slopes = [slope for part in policy + critics for slope in part.slopes]
+        self._of_policy = 2 * len(policy)
+        # One array holds all gradients: the noise's, the policy's, the critic's
+        self._learning = [network.log_std, *self._parameters]
+        sizes = [parameter.numel() for parameter in self._learning]
+        self._gradient = torch.zeros(sum(sizes))
+        split = torch.split(self._gradient, sizes)
+        self._gradients = [part.view_as(of) for part, of in zip(split, self._learning, strict=True)]
+        self._count = 0  # observations of the last forward pass
+        # Rows of its products: the observations, and rows of earlier batches that nobody reads
+        self._size = 0
         self.refresh()
+
+    def gradient_of(self, learns_policy: bool, learns_noise: bool) -> tuple[Tensor, Tensor]:
+        """Return the gradient of what learns (P,), and the noise's part of it: (A,), or (0,) if that does not learn.
+
+        The parameters' ``grad`` are views of it from now on, and None where they do not learn.
+
+        Args:
+            learns_policy: Whether the policy learns, and not the critic alone.
+            learns_noise: Whether the log standard deviation learns too.
+        """
+        first = 0 if learns_noise else 1 if learns_policy else 1 + self._of_policy
+        for index, (parameter, gradient) in enumerate(zip(self._learning, self._gradients, strict=True)):
+            parameter.grad = gradient if index >= first else None
+        start = sum(gradient.numel() for gradient in self._gradients[:first])
+        return self._gradient[start:], self._gradients[0] if learns_noise else torch.zeros(0)
 
     @torch.no_grad()
     def refresh(self) -> None:
         """Take the network's parameters as they are now; call it whenever they have changed."""
-        for layer in (*self._trunk, self._mean, *self._critic, self._value):
-            layer.cast()
+        torch._foreach_copy_(self._places, self._parameters)
 
     @torch.no_grad()
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,17 +191,12 @@ class NetworkPass:
         Args:
             obs: The critic's observations, normalised (n, D), contiguous.
         """
-        obs = obs.to(self.dtype)
-        count = len(obs)
-        self._run_trunk(obs)
-        chain = [*self._critic, self._value]
-        for layer in chain:
-            layer.take(obs)
-        place(self._mean.input_bits[:count], self._mean.hidden, chain[0].input_bits, 0)
-        self._run(chain, self._size)
-        mean, value = (layer.forward(self._size)[:count] for layer in (self._mean, self._value))
-        value = value.squeeze(-1)
-        return mean.to(torch.float32, copy=True), value.to(torch.float32, copy=True)
+        size = self._run_trunk(obs := obs.to(self.dtype))
+        self._heads.take(_bits(obs))
+        self._run(self._critic, size)
+        last = self._critic[-1].forward(size)
+        mean = self._heads.first(size).outputs[: len(obs), -self._actions :]
+        return mean.to(torch.float32, copy=True), last.outputs[: len(obs), 0].to(torch.float32, copy=True)
 
     @torch.no_grad()
     def act(self, obs: Tensor) -> Tensor:
@@ -144,24 +205,25 @@ class NetworkPass:
         Args:
             obs: The policy's observations, normalised (n, obs_size), contiguous.
         """
-        self._run_trunk(obs.to(self.dtype))
-        return self._mean.forward(self._size)[: len(obs)].to(torch.float32, copy=True)
+        size = self._run_trunk(obs.to(self.dtype))
+        return self._heads.last_outputs(size, self._actions)[: len(obs)].to(torch.float32, copy=True)
 
-    def _run_trunk(self, obs: Tensor) -> None:
-        """Run the trunk, up to the inputs of ``mean``."""
-        self._count = count = len(obs)
-        self._size = min(-(-count // SIZE_STEP) * SIZE_STEP, self.rows)
-        chain = [*self._trunk, self._mean]
-        for layer in chain:
-            layer.take(obs)
-        self._run(chain, self._size)
+    def _run_trunk(self, obs: Tensor) -> int:
+        """Run the trunk, up to the heads' hidden inputs, and return how many rows its products have."""
+        self._count = len(obs)
+        self._size = min(-(-self._count // SIZE_STEP) * SIZE_STEP, self.rows)
+        bits = _bits(obs)
+        for layer in self._trunk[:-1]:
+            layer.take(bits)
+        self._run(self._trunk, self._size)
+        return self._size
 
     @staticmethod
-    def _run(layers: list[_Layer], count: int) -> None:
+    def _run(layers: list[_Layer], size: int) -> None:
         """Run layers with ELU between them, up to the inputs of the last."""
         for layer, following in pairwise(layers):
-            layer.forward(count)
-            elu(layer.output_bits[:count], following.input_bits)
+            rows = layer.forward(size)
+            elu(rows.output_bits, following.input_bits, following.hidden)
 
     def evaluate(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Return what ``forward`` does, for any number of observations."""
@@ -171,31 +233,33 @@ class NetworkPass:
 
     @torch.no_grad()
     def backward(self, mean: Tensor | None, value: Tensor | None) -> None:
-        """Set the gradients of the parameters for the last ``forward``; ``log_std`` is not one of its.
+        """Write the gradient of the parameters for the last ``forward``; ``log_std`` is not one of its.
 
         Args:
             mean: Slope of the loss with respect to the mean actions (n, A); None: only the critic's own layers learn.
             value: Slope with respect to the values (n,); None: 0.
         """
         count, size = self._count, self._size
-        self._value.slope[:count, 0] = 0.0 if value is None else value
-        self._value.slope[count:size] = 0.0
-        slope = self._back([*self._critic, self._value], size, is_needed=mean is not None)
-        if mean is None:
-            return
-        self._mean.slope[:count] = mean
-        self._mean.slope[count:size] = 0.0
-        self._mean.backward(size)
-        last = self._trunk[-1]
-        torch.add(slope, self._mean.hidden_slope(size), out=last.slope[:size])
-        elu_gradient(self._mean.input_bits, last.slope_bits[:size])
-        self._back(self._trunk, size, is_needed=False)
-
-    def _back(self, layers: list[_Layer], count: int, is_needed: bool) -> Tensor:
-        """Set the gradients of layers with ELU between them; return the slope of the first one's hidden inputs."""
+        values = self._critic[-1].first(size).slope[:, 0]
+        values[:count] = 0.0 if value is None else value
+        values[count:] = 0.0
+        means = self._heads.first(size).slope[:, -self._actions :]
+        means[:count] = 0.0 if mean is None else mean
+        means[count:] = 0.0
+        layers = self._critic if mean is None else self._layers
         for before, layer in reversed(list(pairwise(layers))):
-            layer.backward(count)
-            torch.mm(layer.slope[:count], layer.weights[:, : layer.hidden], out=before.slope[:count])
-            elu_gradient(layer.input_bits, before.slope_bits[:count])
-        layers[0].backward(count)
-        return layers[0].hidden_slope(count) if is_needed else torch.empty(0)
+            layer.backward(size)
+            rows = before.first(size)
+            layer.backward_hidden(size, rows.slope[:, : layer.hidden])
+            elu_gradient(layer.input_bits, rows.slope_bits, layer.hidden)
+        layers[0].backward(size)
+        first = self._of_policy if mean is None else 0
+        torch._foreach_copy_(self._gradients[1 + first :], self._slopes[first:])
+
+
+def _linears(layers: nn.ModuleList) -> list[nn.Linear]:
+    """Return linear layers as such."""
+    found = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    if len(found) < len(layers):
+        raise TypeError(f"{', '.join(type(layer).__name__ for layer in layers)} as layers; allowed: Linear")
+    return found

@@ -1,9 +1,12 @@
 """Running mean and variance, merged exactly, and the frozen copy that normalises."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from common.jit import kernel
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -29,7 +32,12 @@ class Moments:
     @staticmethod
     def of(data: npt.ArrayLike) -> "Moments":
         """Return the moments of ``data`` (N, D)."""
-        values = np.asarray(data, np.float64)
+        values = np.asarray(data)
+        if values.ndim == 2 and values.dtype == np.float32:  # a learner's observations: ten times as fast
+            mean, var = np.empty((2, values.shape[1]))
+            _moments(np.ascontiguousarray(values), mean, var)
+            return Moments(mean, var, len(values))
+        values = values.astype(np.float64)
         return Moments(values.mean(axis=0), values.var(axis=0), len(values))
 
     def merged(self, other: "Moments") -> "Moments":
@@ -57,6 +65,22 @@ class Moments:
     def recounted(self) -> "Moments":
         """Return the same mean and variance with count 1: what a stage change does (the paper's algorithm 1)."""
         return Moments(self.mean, self.var, 1)
+
+
+@kernel
+def _moments(data: Any, mean: Any, var: Any) -> None:
+    """Write mean and population variance (D,) of ``data`` (N, D), with sums in float64 over one row after the other."""
+    count, width = data.shape
+    mean[:], var[:] = 0.0, 0.0
+    for i in range(count):
+        for j in range(width):
+            mean[j] += data[i, j]
+    mean /= count
+    for i in range(count):
+        for j in range(width):
+            difference = data[i, j] - mean[j]
+            var[j] += difference * difference
+    var /= count
 
 
 def scale_of(moments: Moments) -> Array:

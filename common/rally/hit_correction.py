@@ -6,7 +6,7 @@ are smooth and known, so the hit's result r depends on a small change d of the l
     r(a + d) = r(a) + L d,       L = dr/d(racket's path) . d(racket's path)/d(a)
 
 and the least change that gives the wanted result is d = L' (L L' + lambda)^-1 (wanted - r): one damped Gauss-Newton
-step (Levenberg 1944) per hit. The learner pulls the policy's mean there (``ppo.correction_loss``): iterative learning
+step (Levenberg 1944) per hit. The learner pulls the policy's mean there (``policy.losses``): iterative learning
 control (Arimoto 1984) with a network as its memory. The gradient of the same reward through the same physics (as in
 SHAC, Xu et al. 2022) is large where the stroke is sensitive; this step is not. Its mean over a dataset has five times
 the signal to noise (ADR-0022).

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,17 @@ from services.learner.advantage import gae
 from services.learner.config import PPOConfig
 from services.learner.epoch_stats import PlayStats, merged, play_counts
 from services.learner.group import ALONE, Group
-from services.learner.ppo import Dataset, Share, denormalized, explained_variance
+from services.learner.ppo import Dataset, Share, are_any, denormalized, explained_variance, weight_sum
 
 Floats = npt.NDArray[np.float32]
+COLUMNS: Final = (
+    "obs",
+    "actions",
+    "log_mu",
+    "log_prox",
+    "mean_prox",
+    "corrections",
+)  # of a dataset, from its parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +80,7 @@ class _Part:
     actions: Tensor  # (n, A)
     log_mu: Tensor  # (n,)
     log_prox: Tensor  # (n,)
-    mean: Tensor  # (n, A)
+    mean_prox: Tensor  # (n, A)
     corrections: Tensor  # (n, A)
     advantages: Floats  # (n,)
     values: Floats  # (n,)
@@ -103,49 +112,46 @@ def read(
         on_tick()
     parts = parts or [_nothing(model)]
     group = model.group
-    own = np.stack(
-        [np.concatenate([getattr(part, name) for part in parts]) for name in ("values", "advantages")]
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in COLUMNS}
+    own = np.concatenate([np.stack((part.values, part.advantages), axis=1) for part in parts])
+    # One message has all that a rank must know of another's rollouts
+    told = group.gathered(
+        own,
+        np.array([(weight_sum(columns["log_prox"], columns["log_mu"]), are_any(columns["corrections"]))]),
+        play_counts(rollouts)[None],
+        np.array([float(version - rollout.version) for rollout in rollouts]),
+        np.array([(*part.moments.mean, *part.moments.var, part.moments.count) for part in parts]),
     )
-    ranks = group.gathered(np.ascontiguousarray(own.T))
-    values, advantage = np.ascontiguousarray(np.concatenate(ranks).T)
-    first = sum(map(len, ranks[: group.rank]))
-    mine = slice(first, first + own.shape[1])
+    frames, ratios, counts, lags, moments = zip(*told, strict=True)
+    values, advantage = np.ascontiguousarray(np.concatenate(frames).T)
+    first = sum(map(len, frames[: group.rank]))
+    mine = slice(first, first + len(own))
     target = advantage + values
-    explained = explained_variance(target, values)
-    moments = model.value_moments.merged(Moments.of(target))
-    scale = np.sqrt(moments.var + 1e-5)
+    value_moments = model.value_moments.merged(Moments.of(target))
+    scale = np.sqrt(value_moments.var + 1e-5)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    actions = torch.cat([part.actions for part in parts])
-    data = Dataset(
-        obs=torch.cat([part.obs for part in parts]),
-        actions=actions,
-        log_mu=torch.cat([part.log_mu for part in parts]),
-        log_prox=torch.cat([part.log_prox for part in parts]),
-        mean_prox=torch.cat([part.mean for part in parts]),
-        log_std_prox=log_std,
-        advantages=torch.from_numpy(advantage[mine]),
-        value_targets=torch.from_numpy(((target[mine] - moments.mean) / scale).astype(np.float32)),
-        corrections=torch.cat([part.corrections for part in parts]),
-    )
-    lags = np.array([float(version - rollout.version) for rollout in rollouts])
+    weight, corrected = np.concatenate(ratios).sum(axis=0)
     return Batch(
-        data=data,
-        share=Share(group, first, len(target)),
-        explained=explained,
-        value_moments=moments,
-        obs_moments=tuple(_gathered_moments([part.moments for part in parts], group)),
-        play=merged([counts[0] for counts in group.gathered(play_counts(rollouts)[None])]),
-        lag=float(np.mean(np.concatenate(group.gathered(lags)))),
+        data=Dataset(
+            **columns,
+            log_std_prox=log_std,
+            advantages=torch.from_numpy(advantage[mine]),
+            value_targets=torch.from_numpy(((target[mine] - value_moments.mean) / scale).astype(np.float32)),
+        ),
+        share=Share(group, first, len(target), float(weight) / len(target), bool(corrected)),
+        explained=explained_variance(target, values),
+        value_moments=value_moments,
+        obs_moments=tuple(_moments(row) for row in np.concatenate(moments) if row[-1]),
+        play=merged(np.concatenate(counts)),
+        lag=float(np.mean(np.concatenate(lags))),
         frames=len(target),
     )
 
 
-def _gathered_moments(own: Sequence[Moments], group: Group) -> list[Moments]:
-    """Return the moments of every rank's rollouts, in the order of ranks."""
-    rows = np.array([[*moments.mean, *moments.var, moments.count] for moments in own])
-    size = (rows.shape[1] - 1) // 2
-    every = (row for rank in group.gathered(rows) for row in rank)
-    return [Moments(row[:size], row[size:-1], int(row[-1])) for row in every if row[-1]]
+def _moments(row: npt.NDArray[np.float64]) -> Moments:
+    """Return moments from [mean, variance, count]."""
+    mean, var = np.split(row[:-1], 2)
+    return Moments(mean, var, int(row[-1]))
 
 
 @torch.no_grad()
@@ -176,7 +182,7 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
         actions=actions,
         log_mu=torch.tensor(r.log_mu.reshape(-1)),
         log_prox=log_prob(actions, mean, log_std),
-        mean=mean,
+        mean_prox=mean,
         corrections=torch.tensor(corrections.reshape(-1, corrections.shape[-1])),
         advantages=advantage.reshape(-1),
         values=values.reshape(-1),
@@ -194,7 +200,7 @@ def _nothing(model: Model) -> _Part:
         actions=actions,
         log_mu=none,
         log_prox=none,
-        mean=actions,
+        mean_prox=actions,
         corrections=actions,
         advantages=np.zeros(0, np.float32),
         values=np.zeros(0, np.float32),

@@ -81,8 +81,8 @@ class PlayStats:
         return _share(self.error_sum, self.returned)
 
 
-def merged(parts: Sequence[npt.NDArray[np.float64]]) -> PlayStats:
-    """Return the results of several datasets together, from each one's ``play_counts``."""
+def merged(parts: npt.NDArray[np.float64]) -> PlayStats:
+    """Return the results of several datasets together, from each one's ``play_counts``: (datasets, C)."""
     total = np.sum(parts, axis=0)
     rallies, caught, over, returned, unvalidated = (int(count) for count in total[:5])
     error_sum, return_sum, frames = (float(value) for value in total[5:8])
@@ -142,4 +142,4 @@ def play_counts(rollouts: Sequence[Rollout]) -> npt.NDArray[np.float64]:
 
 def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
     """Return the counts over the rallies that ended in ``rollouts``."""
-    return merged([play_counts(rollouts)])
+    return merged(play_counts(rollouts)[None])

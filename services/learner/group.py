@@ -1,4 +1,4 @@
-"""A group of learners that train one policy together: data-parallel, over torch.distributed.
+"""A group of learners that train one policy together: data-parallel.
 
 Every rank has the same network, optimiser and random state, and the rollouts of its own actors. The dataset of an epoch
 is the rollouts of all ranks, in the order of ranks. A minibatch is drawn from the whole dataset. Each rank computes the
@@ -6,32 +6,51 @@ part of its gradient that belongs to its own frames, and the parts are summed. S
 they are those of one learner that has all the rollouts, up to the rounding of sums.
 
 torchrun starts the ranks and says in the environment who they are (RANK, WORLD_SIZE, MASTER_ADDR, MASTER_PORT). The
-ranks of one machine (`deploy.learners`) find each other by a file instead (GROUP_FILE), so that they open no port to
-other machines: neither torch's store nor its links ask who connects.
+ranks of one machine (`deploy.learners`) have a file instead (GROUP_FILE): they share memory, and open no port.
 """
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from datetime import timedelta
-from typing import Any, Final
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
-import torch
-import torch.distributed
-from torch import Tensor
 
 from common.comms.budgets import one_line
 from common.comms.keys import rank_of
 from common.errors import ReportedError
+from services.learner.shared_memory import SharedMemoryLinks
+from services.learner.torch_links import TorchLinks
 
-TIMEOUT: Final = timedelta(seconds=60)  # a rank that is silent for so long has died, and the group ends
+TIMEOUT_S: Final = 60.0  # a rank that is silent for so long has died, and the group ends
+
+Array = npt.NDArray[Any]
 
 
 class GroupError(ReportedError):
     """The environment does not say which rank this process is, or another rank is lost."""
+
+
+class Links(Protocol):
+    """A rank's links to the others. All ranks make the same calls in the same order.
+
+    Every method raises RuntimeError or OSError where another rank does not do its part.
+    """
+
+    def exchanged(self, own: bytes, on_tick: Callable[[], None] | None = None) -> list[bytes]:
+        """Return every rank's bytes, in the order of ranks; ``on_tick`` is called until the others have come."""
+        ...
+
+    def add(self, values: Array) -> None:
+        """Replace ``values`` (n,), contiguous, by their sum over the ranks: the same bits on each."""
+        ...
+
+    def close(self) -> None:
+        """Close them."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +59,7 @@ class Group:
 
     rank: int = 0
     size: int = 1
+    links: Links | None = field(default=None, compare=False)  # None: there is no other rank
 
     @property
     def leads(self) -> bool:
@@ -54,42 +74,40 @@ class Group:
         """Return whether an actor belongs to this rank."""
         return self.rank_of(actor) == self.rank
 
-    def add(self, values: Tensor) -> None:
-        """Replace ``values`` by their sum over the ranks, the same bits on each."""
-        if self.size > 1:
+    def add(self, values: Array) -> None:
+        """Replace ``values`` (n,), contiguous, by their sum over the ranks: the same bits on each."""
+        if self.links is not None:
             with self._together():
-                torch.distributed.all_reduce(values)
+                self.links.add(values)
 
-    def gathered(
-        self, array: npt.NDArray[Any], on_tick: Callable[[], None] | None = None
-    ) -> list[npt.NDArray[Any]]:
-        """Return every rank's array (n, ...), in the order of ranks; n may differ from rank to rank.
+    def gathered(self, *arrays: Array, on_tick: Callable[[], None] | None = None) -> list[list[Array]]:
+        """Return every rank's arrays, in the order of ranks, by one message; of other ranks they are read-only.
 
         Args:
-            array: This rank's.
+            arrays: This rank's (n, ...); n may differ from rank to rank, all else is the same.
             on_tick: Called again and again until the other ranks have come.
         """
-        if self.size == 1:
-            return [array]
-        own = torch.from_numpy(np.array(array))
-        counts = [torch.zeros(1, dtype=torch.int64) for _ in range(self.size)]
-        self._all_gather(counts, torch.tensor([len(own)]), on_tick)
-        longest = max(int(count) for count in counts)
-        padded = own.new_zeros((longest, *own.shape[1:]))
-        padded[: len(own)] = own
-        rows = [torch.empty_like(padded) for _ in range(self.size)]
-        self._all_gather(rows, padded)
-        return [part[: int(count)].numpy() for part, count in zip(rows, counts, strict=True)]
+        if self.links is None:
+            return [list(arrays)]
+        ranks = self.gathered_bytes([array.tobytes() for array in arrays], on_tick)
+        return [
+            [
+                np.frombuffer(part, array.dtype).reshape(-1, *array.shape[1:])
+                for part, array in zip(parts, arrays, strict=True)
+            ]
+            for parts in ranks
+        ]
 
-    def gathered_bytes(self, items: Sequence[bytes]) -> list[list[bytes]]:
-        """Return every rank's list of byte strings, in the order of ranks."""
-        lengths = self.gathered(np.array([len(item) for item in items], np.int64))
-        texts = self.gathered(np.frombuffer(b"".join(items), np.uint8))
-        found = []
-        for length, text in zip(lengths, texts, strict=True):
-            ends = np.cumsum(length)
-            found.append([text[end - n : end].tobytes() for n, end in zip(length, ends, strict=True)])
-        return found
+    def gathered_bytes(
+        self, items: Sequence[bytes], on_tick: Callable[[], None] | None = None
+    ) -> list[list[bytes]]:
+        """Return every rank's list of byte strings, in the order of ranks; their numbers may differ."""
+        if self.links is None:
+            return [list(items)]
+        lengths = np.array([len(items), *map(len, items)], np.int64)
+        with self._together():
+            ranks = self.links.exchanged(b"".join((lengths.tobytes(), *items)), on_tick)
+        return [_apart(text) for text in ranks]
 
     def of_leader(self, value: bytes) -> bytes:
         """Return the leader's ``value``; those of other ranks are not looked at."""
@@ -97,33 +115,32 @@ class Group:
 
     def leave(self) -> None:
         """Close the connections to the other ranks."""
-        if self.size > 1:
-            torch.distributed.destroy_process_group()
-
-    def _all_gather(
-        self, results: list[Tensor], own: Tensor, on_tick: Callable[[], None] | None = None
-    ) -> None:
-        with self._together():
-            work = torch.distributed.all_gather(results, own, async_op=True)
-            while on_tick is not None and not work.is_completed():
-                on_tick()
-            work.wait()
+        if self.links is not None:
+            self.links.close()
 
     @contextmanager
     def _together(self) -> Iterator[None]:
         """Raise GroupError where another rank does not do its part."""
         try:
             yield
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
             reason = one_line(str(error), 200)
             raise GroupError(f"rank {self.rank} of {self.size} learners lost another one: {reason}") from None
+
+
+def _apart(text: bytes) -> list[bytes]:
+    """Return the byte strings that ``Group.gathered_bytes`` has joined: their number, their lengths, themselves."""
+    count = int(np.frombuffer(text, np.int64, 1)[0])
+    lengths = np.frombuffer(text, np.int64, 1 + count)[1:]
+    ends = 8 * (1 + count) + np.cumsum(lengths)
+    return [text[end - length : end] for end, length in zip(ends, lengths, strict=True)]
 
 
 ALONE: Final = Group()
 
 
-def join(environment: Mapping[str, str] = os.environ, backend: str = "gloo") -> Group:
-    """Return the group that torchrun has put this process into; ``ALONE`` without torchrun.
+def join(environment: Mapping[str, str] = os.environ) -> Group:
+    """Return the group that torchrun or `deploy.learners` has put this process into; ``ALONE`` without them.
 
     Raises:
         GroupError: The environment is incomplete, or the other ranks do not come.
@@ -139,10 +156,12 @@ def join(environment: Mapping[str, str] = os.environ, backend: str = "gloo") -> 
         ) from None
     if size == 1:
         return ALONE
-    file = environment.get("GROUP_FILE", "")
-    where = f"file://{file}" if file else "env://"
     try:
-        torch.distributed.init_process_group(backend, where, rank=rank, world_size=size, timeout=TIMEOUT)
-    except (ValueError, RuntimeError) as error:
+        return Group(rank, size, _links(rank, size, environment.get("GROUP_FILE", "")))
+    except (ValueError, RuntimeError, OSError) as error:
         raise GroupError(f"rank {rank} of {size} found no group: {error}") from None
-    return Group(rank, size)
+
+
+def _links(rank: int, size: int, file: str) -> Links:
+    """Return the links to the other ranks: over shared memory if they have a file, else those of torch."""
+    return SharedMemoryLinks(rank, size, Path(file), TIMEOUT_S) if file else TorchLinks(rank, size, TIMEOUT_S)

@@ -52,7 +52,7 @@ class Lockstep:
             self._contributors, self._next_count = intake.contributors(now), now + RECOUNT_S
         mine = fates(intake.total())
         row = [intake.queued, *self._contributors, ends, *mine.values()]
-        rows = np.array(self.group.gathered(np.array(row, np.int64), on_tick))
+        rows = np.array([own for (own,) in self.group.gathered(np.array(row, np.int64), on_tick=on_tick)])
         ranks = [Rank.of(row[:4]) for row in rows]
         self.fates = dict(zip(mine, (int(sum_) for sum_ in rows[:, 4:].sum(0)), strict=True))
         self.queued = sum(rank.queued for rank in ranks)

@@ -14,18 +14,21 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from enum import Enum, auto
-from typing import NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from common.policy.actor_critic import entropy, kl_divergence, log_prob
+from common.policy.actor_critic import entropy
+from common.policy.losses import Frames, LossWeights, Slopes, Sums, add_losses
 from common.policy.network_pass import NetworkPass, Precision, native_precision
 from common.policy.normalizer import Moments
 from services.learner.config import PPOConfig
 from services.learner.group import ALONE, Group
+
+Array = npt.NDArray[np.float64]
 
 MAX_WEIGHT = 2.0  # clip of pi_prox/mu
 KL_STEP = 1.5  # factor of one learning-rate adjustment
@@ -53,10 +56,23 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.obs)
 
-    def taken(self, rows: Tensor | slice) -> Self:
-        """Return some frames; of a slice they are views."""
-        columns = {field.name: getattr(self, field.name)[rows] for field in fields(self)[:-1]}
-        return replace(self, **columns)
+    def taken(self, rows: Tensor) -> Self:
+        """Return the frames of some rows, as copies."""
+        return self._of(lambda column: torch.index_select(column, 0, rows))
+
+    def between(self, start: int, end: int) -> Self:
+        """Return the frames of a range of rows, as views."""
+        return self._of(lambda column: column[start:end])
+
+    def _of(self, part: Callable[[Tensor], Tensor]) -> Self:
+        return replace(self, **{name: part(getattr(self, name)) for name in COLUMNS})
+
+    def frames(self) -> Frames:
+        """Return what the losses need of them."""
+        return Frames(*(getattr(self, name).numpy() for name in Frames._fields))
+
+
+COLUMNS: Final = tuple(field.name for field in fields(Dataset) if field.name != "log_std_prox")
 
 
 class UpdateMode(Enum):
@@ -96,41 +112,30 @@ class UpdateStats:
     finite: bool  # False: a gradient step was skipped because it was not finite
 
 
-def policy_loss(log_new: Tensor, log_prox: Tensor, log_mu: Tensor, advantages: Tensor, clip: float) -> Tensor:
-    """Return decoupled PPO's clipped surrogate loss (a scalar)."""
-    ratio = torch.exp(log_new - log_prox)
-    weight = torch.exp(log_prox - log_mu).clamp(max=MAX_WEIGHT).detach()
-    clipped = ratio.clamp(1.0 - clip, 1.0 + clip)
-    return -(weight * torch.minimum(ratio * advantages, clipped * advantages)).mean()
-
-
-def correction_loss(mean: Tensor, acted: Tensor, corrections: Tensor) -> Tensor:
-    """Return half the mean squared distance of the mean actions from the corrected ones, where there are any.
-
-    The corrected action is acted + correction. A hit correction is added to the mean at the start of this update,
-    without the noise.
-
-    Args:
-        mean: (N, A).
-        acted: (N, A).
-        corrections: (N, A); a row of zeros is no correction. A zero in any other row leaves that action as it was (an
-            action that was clipped, a drive at its limit).
-    """
-    is_corrected = (corrections != 0.0).any(-1, keepdim=True)
-    return 0.5 * ((mean - acted - corrections).square() * is_corrected).sum(-1).mean()
-
-
 class Share(NamedTuple):
-    """Which frames of the group's dataset a rank has."""
+    """Which frames of the group's dataset a rank has, and what it must know of the others'."""
 
     group: Group
     first: int  # index of its first frame
     frames: int  # of the whole dataset
+    weight: float  # mean of pi_prox/mu before clipping, of the whole dataset
+    has_corrections: bool  # whether any frame has one
 
 
 def whole(data: Dataset) -> Share:
     """Return the share of a learner alone: all of its dataset."""
-    return Share(ALONE, 0, len(data))
+    weight = weight_sum(data.log_prox, data.log_mu) / len(data)
+    return Share(ALONE, 0, len(data), weight, are_any(data.corrections))
+
+
+def weight_sum(log_prox: Tensor, log_mu: Tensor) -> float:
+    """Return the sum of pi_prox/mu over the frames, before clipping."""
+    return float((log_prox - log_mu).exp().sum())
+
+
+def are_any(corrections: Tensor) -> bool:
+    """Return whether any frame has a correction."""
+    return bool((corrections != 0.0).any())
 
 
 def minibatches(
@@ -155,28 +160,8 @@ def minibatches(
         count = int(mine.sum())
         # a small remainder would weigh as much as a full batch
         if len(mine) >= min(size, share.frames) // 2:
-            yield shuffled.taken(slice(at, at + count)), len(mine)
+            yield shuffled.between(at, at + count), len(mine)
         at += count
-
-
-def sum_gradients(parameters: list[torch.nn.Parameter], group: Group) -> None:
-    """Replace the parameters' gradients by their sums over the ranks: one message for all of them."""
-    if group.size == 1:
-        return
-    learning = [parameter for parameter in parameters if parameter.requires_grad]
-    for parameter in learning:
-        if parameter.grad is None:  # the minibatch has no frame of this rank
-            parameter.grad = torch.zeros_like(parameter)
-    gradients = [parameter.grad for parameter in learning if parameter.grad is not None]
-    flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
-    group.add(flat)
-    parts = torch.split(flat, [gradient.numel() for gradient in gradients])
-    torch._foreach_copy_(gradients, [p.view_as(g) for p, g in zip(parts, gradients, strict=True)])
-
-
-def bound_loss(mean: Tensor) -> Tensor:
-    """Return the mean squared excess of mean actions beyond +-1: targets that no joint can reach."""
-    return (mean.abs() - 1.0).clamp(min=0.0).square().sum(-1).mean()
 
 
 def adapted_learning_rate(rate: float, kl: float, low: float, high: float, target: float) -> float:
@@ -201,44 +186,24 @@ def denormalized(values: Tensor, moments: Moments) -> npt.NDArray[np.float32]:
     return result
 
 
-@dataclass(frozen=True, slots=True)
-class _Losses:
-    """Losses of one minibatch."""
+def kl_sum(batch: Dataset, moved: Array, log_std: Tensor) -> float:
+    """Return the sum over a minibatch of KL(prox, new).
 
-    policy: Tensor
-    value: Tensor
-    bound: Tensor
-    correction: Tensor
-    total: Tensor
-    log_new: Tensor  # (n,)
+    Args:
+        batch: Its frames.
+        moved: Sum over the frames of the squared changes of the mean action (A,).
+        log_std: Of the new policy (A,).
+    """
+    old, new = (values.double().numpy() for values in (batch.log_std_prox, log_std))
+    spread = (len(batch) * np.exp(2.0 * old) + moved) / (2.0 * np.exp(2.0 * new))
+    return float((len(batch) * (new - old - 0.5) + spread).sum())
 
 
-def _losses(
-    mean: Tensor,
-    values: Tensor,
-    log_std: Tensor,
-    batch: Dataset,
-    config: PPOConfig,
-    mode: UpdateMode,
-    is_corrected: bool,
-) -> _Losses:
-    """Return the losses of one minibatch, given the network's outputs (n, A) and (n,)."""
-    log_new = log_prob(batch.actions, mean, log_std)
-    loss_policy = torch.zeros(())
-    if mode is UpdateMode.PPO:
-        loss_policy = policy_loss(log_new, batch.log_prox, batch.log_mu, batch.advantages, config.clip)
-    loss_value = 0.5 * (values - batch.value_targets).square().mean()
-    loss_bound = bound_loss(mean)
-    loss = loss_policy + config.value_weight * loss_value + config.bound_weight * loss_bound
-    loss_correction = torch.zeros(())
-    if is_corrected:
-        # A teacher's correction is relative to the played action, a hit's to the mean action
-        acted = batch.actions if mode is UpdateMode.DISTILL else batch.mean_prox
-        loss_correction = correction_loss(mean, acted, batch.corrections)
-        loss = loss + config.correction_weight * loss_correction
-    if config.entropy_weight > 0:
-        loss = loss - config.entropy_weight * entropy(log_std)
-    return _Losses(loss_policy, loss_value, loss_bound, loss_correction, loss, log_new)
+def limit_norm(gradient: Tensor, longest: float) -> float:
+    """Shorten a gradient that is longer than ``longest``, and return its length before."""
+    norm = float(torch.linalg.vector_norm(gradient))
+    gradient.mul_(min(longest / (norm + 1e-6), 1.0))  # as torch's clip_grad_norm_ does
+    return norm
 
 
 def update(
@@ -269,75 +234,78 @@ def update(
     """
     share = share or whole(data)
     group = share.group
-    network = network_pass.network
-    parameters = list(network.parameters())
+    log_std = network_pass.network.log_std.detach()
     learns = mode is not UpdateMode.CRITIC_ONLY
-    for parameter in network.policy_parameters():
-        parameter.requires_grad_(learns)  # a frozen one has no gradient, so that Adam does not change it
-    # Of this rank, until they are summed: sums over gradient steps, and log_prox - log_mu over frames
-    sums = np.zeros(6)
-    about = torch.tensor([(data.log_prox - data.log_mu).exp().sum(), (data.corrections != 0.0).any()])
-    group.add(about)
-    is_corrected = config.correction_weight > 0 and learns and bool(about[1])
+    learns_noise = mode is UpdateMode.PPO or (learns and config.entropy_weight > 0)
+    gradient, noise_gradient = network_pass.gradient_of(learns, learns_noise)
+    weights = LossWeights(
+        clip=config.clip,
+        value=config.value_weight,
+        bound=config.bound_weight,
+        correction=config.correction_weight if learns and share.has_corrections else 0.0,
+        most_weight=MAX_WEIGHT,
+        has_surrogate=mode is UpdateMode.PPO,
+        # A teacher's correction is relative to the played action, a hit's to the mean action
+        from_played=mode is UpdateMode.DISTILL,
+    )
+    shape = data.actions.shape
+    slopes = Slopes(*(np.zeros(n, np.float32) for n in (shape, shape[:1], shape[1:])))
+    moved = np.zeros(shape[1])
+    losses, norms, steps = np.zeros(len(Sums._fields)), 0.0, 0
     learning_rate = rate.start
-    steps, finite, kl = 0, True, 0.0
+    finite, kl = True, 0.0
     for _ in range(config.mini_epochs):
         for settings in optimizer.param_groups:
             settings["lr"] = learning_rate
-        kl_sum, batches = 0.0, 0
+        # of this rank: sum of the KL divergences, and of the losses
+        sums, batches = np.zeros(1 + len(losses)), 0
         for batch, count in minibatches(data, config.minibatch, generator, share):
-            part = len(batch) / count  # 1 for a learner alone: losses are means over a rank's frames
-            optimizer.zero_grad(set_to_none=True)
-            if part:
+            if len(batch):
                 mean, values = network_pass.forward(batch.obs)
-                mean.requires_grad_(learns)
-                values.requires_grad_()
-                losses = _losses(mean, values, network.log_std, batch, config, mode, is_corrected)
-                (part * losses.total).backward()  # type: ignore[no-untyped-call]
-                network_pass.backward(mean.grad, values.grad)
-            sum_gradients(parameters, group)
-            norm = float(torch.nn.utils.clip_grad_norm_(parameters, config.gradient_norm, foreach=True))
+                found = add_losses(
+                    *(mean.numpy(), values.numpy(), log_std.numpy(), batch.frames(), weights, count),
+                    *slopes,
+                    moved,
+                )
+                rows = slice(len(batch))
+                network_pass.backward(
+                    torch.from_numpy(slopes.mean[rows]) if learns else None,
+                    torch.from_numpy(slopes.value[rows]),
+                )
+                if learns_noise:
+                    noise_gradient.copy_(torch.from_numpy(slopes.log_std))
+                    noise_gradient.sub_(config.entropy_weight * len(batch) / count)
+            else:
+                gradient.zero_()
+            group.add(gradient.numpy())
+            norm = limit_norm(gradient, config.gradient_norm)
             if not np.isfinite(norm):
                 finite = False
                 continue
             optimizer.step()
             network_pass.refresh()
-            steps, batches = steps + 1, batches + 1
-            if part:
-                with torch.no_grad():
-                    moved = kl_divergence(batch.mean_prox, batch.log_std_prox, mean, network.log_std)
-                    outside = ((losses.log_new - batch.log_prox).exp() - 1.0).abs() > config.clip
-                kl_sum += part * float(moved)
-                sums += part * np.array(
-                    (
-                        losses.policy.item(),
-                        losses.value.item(),
-                        losses.bound.item(),
-                        outside.float().mean().item(),
-                        norm,
-                        losses.correction.item(),
-                    )
-                )
+            norms, batches = norms + norm, batches + 1
+            if len(batch):
+                sums += np.array([kl_sum(batch, moved, log_std), *found]) / count
             on_tick()
-        total = torch.tensor([kl_sum], dtype=torch.float64)
-        group.add(total)
-        kl = float(total[0]) / batches if batches else math.inf  # no step was finite: smaller ones are needed
+        group.add(sums)
+        losses, steps = losses + sums[1:], steps + batches
+        kl = float(sums[0]) / batches if batches else math.inf  # no step was finite: smaller ones are needed
         if mode is UpdateMode.PPO and config.schedule == "adaptive":
             learning_rate = adapted_learning_rate(
                 learning_rate, kl, config.learning_rate_min, rate.highest, config.target_kl
             )
-    group.add(torch.from_numpy(sums))
-    means = sums / max(steps, 1)
+    means = Sums(*(losses / max(steps, 1)).tolist())
     return UpdateStats(
-        policy_loss=float(means[0]),
-        value_loss=float(means[1]),
-        bound_loss=float(means[2]),
-        correction_loss=float(means[5]),
-        entropy=float(entropy(network.log_std.detach())),
+        policy_loss=means.policy,
+        value_loss=means.value,
+        bound_loss=means.bound,
+        correction_loss=means.correction,
+        entropy=float(entropy(log_std)),
         kl=kl,
-        clip_fraction=float(means[3]),
-        weight=float(about[0]) / share.frames,
-        gradient_norm=float(means[4]),
+        clip_fraction=means.outside,
+        weight=share.weight,
+        gradient_norm=norms / max(steps, 1),
         explained_variance=explained,
         learning_rate=learning_rate,
         finite=finite,

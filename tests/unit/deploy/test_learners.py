@@ -57,5 +57,4 @@ def test_ranks_find_each_other_on_this_machine_only():
         "RANK": "1",
         "WORLD_SIZE": "3",
         "GROUP_FILE": "/tmp/group",
-        "GLOO_SOCKET_IFNAME": "lo",
     }

@@ -46,6 +46,15 @@ def by_autograd(network, obs, mean_slope, value_slope, precision):
     return mean.detach().float(), value.detach().float(), gradients(network)
 
 
+def differentiated(written, obs, mean_slope, value_slope):
+    """Return outputs and gradients, as the written-out pass has them."""
+    gradient, _ = written.gradient_of(mean_slope is not None, False)
+    gradient.fill_(float("nan"))  # of an earlier step nothing stays
+    outputs = written.forward(obs)
+    written.backward(mean_slope, value_slope)
+    return *outputs, gradients(written.network)
+
+
 def gradients(network):
     return {
         name: parameter.grad.clone()
@@ -63,14 +72,11 @@ def test_outputs_and_gradients_are_autograds(units, privileged, precision, outpu
     network = make_network(units, privileged)
     obs, mean_slope, value_slope = make_slopes(network, 300)
     mean, value, expected = by_autograd(network, obs, mean_slope, value_slope, precision)
-    network.zero_grad()
     written = NetworkPass(network, 512, precision)
-    got_mean, got_value = written.forward(obs)
-    written.backward(mean_slope, value_slope)
+    got_mean, got_value, got = differentiated(written, obs, mean_slope, value_slope)
 
     torch.testing.assert_close(got_mean, mean, atol=outputs, rtol=0)
     torch.testing.assert_close(got_value, value, atol=outputs, rtol=0)
-    got = gradients(network)
     assert got.keys() == expected.keys()
     assert "log_std" not in got
     for name, gradient in expected.items():
@@ -85,9 +91,7 @@ def test_bfloat16_loses_no_more_than_autograd_does():
     *_, truth = by_autograd(exact, obs.double(), mean_slope.double(), value_slope.double(), "float32")
     *_, autograd = by_autograd(network, obs, mean_slope, value_slope, "bfloat16")
     written = NetworkPass(network, 2048, "bfloat16")
-    written.forward(obs)
-    written.backward(mean_slope, value_slope)
-    got = gradients(network)
+    *_, got = differentiated(written, obs, mean_slope, value_slope)
 
     for name, gradient in truth.items():
         lost, loses = (float((g[name] - gradient).norm() / gradient.norm()) for g in (autograd, got))
@@ -99,15 +103,31 @@ def test_a_critic_that_learns_alone_has_its_gradient_and_the_policy_none(privile
     network = make_network(privileged=privileged)
     obs, mean_slope, value_slope = make_slopes(network, 64)
     *_, expected = by_autograd(network, obs, mean_slope, value_slope, "float32")
-    network.zero_grad()
-    written = NetworkPass(network, 64, "float32")
-    written.forward(obs)
-    written.backward(None, value_slope)
-    got = gradients(network)
+    *_, got = differentiated(NetworkPass(network, 64, "float32"), obs, None, value_slope)
 
     assert {name.split(".")[0] for name in got} == ({"critic_head", "value"} if privileged else {"value"})
     for name, gradient in got.items():
         torch.testing.assert_close(gradient, expected[name], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("learns_policy", "learns_noise"), [(True, True), (True, False), (False, False)])
+def test_one_array_holds_the_gradients_of_what_learns_and_of_nothing_else(learns_policy, learns_noise):
+    network = make_network()
+    written = NetworkPass(network, 64, "float32")
+    written.gradient_of(True, True)
+    gradient, noise = written.gradient_of(learns_policy, learns_noise)
+    gradient.copy_(torch.arange(len(gradient)))
+    policy = {id(parameter) for parameter in network.policy_parameters()}
+    learning = {
+        name: parameter
+        for name, parameter in network.named_parameters()
+        if (learns_noise if name == "log_std" else learns_policy or id(parameter) not in policy)
+    }
+
+    assert {name for name, p in network.named_parameters() if p.grad is not None} == learning.keys()
+    held = torch.cat([parameter.grad.reshape(-1) for parameter in learning.values()])
+    assert torch.equal(held.sort().values, torch.arange(len(gradient), dtype=torch.float32))
+    assert torch.equal(noise, network.log_std.grad) if learns_noise else len(noise) == 0
 
 
 def test_it_follows_the_parameters_and_a_small_batch_leaves_nothing_of_a_large_one():
@@ -120,13 +140,11 @@ def test_it_follows_the_parameters_and_a_small_batch_leaves_nothing_of_a_large_o
     written.refresh()
     obs, mean_slope, value_slope = make_slopes(network, 50)
     mean, value, expected = by_autograd(network, obs, mean_slope, value_slope, "float32")
-    network.zero_grad()
-    got_mean, got_value = written.forward(obs)
-    written.backward(mean_slope, value_slope)
+    got_mean, got_value, got = differentiated(written, obs, mean_slope, value_slope)
 
     torch.testing.assert_close(got_mean, mean)
     torch.testing.assert_close(got_value, value)
-    for name, gradient in gradients(network).items():
+    for name, gradient in got.items():
         torch.testing.assert_close(gradient, expected[name], atol=1e-5, rtol=1e-4)
 
 

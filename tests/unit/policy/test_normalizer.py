@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,6 +18,17 @@ def test_moments_merged_from_parts_equal_those_of_all_data_at_once(cuts, offset,
     assert merged.count == 300
     np.testing.assert_allclose(merged.mean, data.mean(axis=0), rtol=1e-12, atol=1e-9)
     np.testing.assert_allclose(merged.var, data.var(axis=0), rtol=1e-9)
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_moments_of_float32_are_those_of_the_same_numbers_in_float64(step):
+    """Far from zero, where the squares of float32 would lose the variance."""
+    data = np.random.default_rng(0).normal(1000.0, 0.5, size=(999, 11)).astype(np.float32)[::step, ::step]
+    moments, exact = Moments.of(data), data.astype(np.float64)
+
+    assert moments.count == len(data)
+    np.testing.assert_allclose(moments.mean, exact.mean(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(moments.var, exact.var(axis=0), rtol=1e-11)
 
 
 def test_merging_in_another_order_gives_the_same():

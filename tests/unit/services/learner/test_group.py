@@ -58,32 +58,48 @@ def outcome(training: Training) -> dict[str, np.ndarray]:
 
 def exchanged(group: Group) -> None:
     """Check what every rank gets of the others."""
-    counts = group.gathered(np.arange(group.rank))
-    assert [len(row) for row in counts] == list(range(group.size))
+    ticks = []
+    told = group.gathered(
+        np.arange(group.rank), np.full((2, 3), group.rank, np.float32), on_tick=lambda: ticks.append(0)
+    )
+    for rank, (numbers, block) in enumerate(told):
+        np.testing.assert_array_equal(numbers, np.arange(rank))
+        np.testing.assert_array_equal(block, np.full((2, 3), rank, np.float32))
+    long = np.arange(group.rank * 300_000.0)  # in pieces, where memory is shared; of the first rank nothing
+    for rank, (numbers,) in enumerate(group.gathered(long)):
+        np.testing.assert_array_equal(numbers, np.arange(rank * 300_000.0))
     texts = [b"", bytes(range(256)), b"x" * group.rank][: group.rank + 1]
     assert group.gathered_bytes(texts)[-1] == [b"", bytes(range(256)), b"x" * (group.size - 1)][: group.size]
     assert group.gathered_bytes([])[0] == []
     assert group.of_leader(b"of the leader" if group.leads else b"of another") == b"of the leader"
 
 
-def rank_main(rank: int, size: int, port: int, ppo: PPOConfig, results: Connection) -> None:
-    environment = {"RANK": str(rank), "WORLD_SIZE": str(size)}
+def summed(group: Group) -> None:
+    """Check that sums are those of all ranks: of few numbers, and of so many that they go in pieces and shares."""
+    for count in (1, 5, 300_001):
+        numbers = np.arange(count) + 1000.0 * group.rank
+        group.add(numbers)
+        expected = group.size * np.arange(count) + 1000.0 * sum(range(group.size))
+        np.testing.assert_array_equal(numbers, expected)
+
+
+def rank_main(rank: int, size: int, where: dict[str, str], ppo: PPOConfig, results: Connection) -> None:
     import os
 
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    group = join(environment)
+    os.environ |= where  # torch reads its part from there
+    group = join({"RANK": str(rank), "WORLD_SIZE": str(size), **where})
     exchanged(group)
+    summed(group)
     results.send(outcome(trained(group, ppo)))
     group.leave()
 
 
-def train_together(size: int, ppo: PPOConfig) -> list[dict[str, np.ndarray]]:
+def train_together(size: int, where: dict[str, str], ppo: PPOConfig) -> list[dict[str, np.ndarray]]:
     """Return every rank's outcome."""
-    port = free_port()
     context = multiprocessing.get_context("spawn")
     pipes = [context.Pipe(duplex=False) for _ in range(size)]
     ranks = [
-        context.Process(target=rank_main, args=(rank, size, port, ppo, pipes[rank][1]))
+        context.Process(target=rank_main, args=(rank, size, where, ppo, pipes[rank][1]))
         for rank in range(size)
     ]
     for rank in ranks:
@@ -94,26 +110,34 @@ def train_together(size: int, ppo: PPOConfig) -> list[dict[str, np.ndarray]]:
     return found
 
 
-@pytest.mark.parametrize(("size", "minibatch"), [(2, 64), (4, 32)])
-def test_ranks_reach_the_parameters_of_one_learner(size, minibatch):
+@pytest.mark.parametrize(
+    ("size", "minibatch", "links"), [(2, 64, "memory"), (2, 64, "torch"), (4, 32, "memory")]
+)
+def test_ranks_reach_the_parameters_of_one_learner(size, minibatch, links, tmp_path):
     """Of four ranks with minibatches of 32 some have no frame in a minibatch, and the others train it."""
     ppo = PPOConfig(
         minibatch=minibatch, mini_epochs=2, precision="float32", correction_weight=5.0, refit_epochs=1
     )
+    where = (
+        {"GROUP_FILE": str(tmp_path / "group")}
+        if links == "memory"
+        else {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free_port())}
+    )
     alone = outcome(trained(ALONE, ppo))
-    ranks = train_together(size, ppo)
+    ranks = train_together(size, where, ppo)
 
     for rank in ranks:
         assert rank.keys() == alone.keys()
         for name, expected in alone.items():
             np.testing.assert_allclose(rank[name], expected, rtol=0, atol=1e-6, err_msg=name)
             np.testing.assert_array_equal(rank[name], ranks[0][name], err_msg=name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_pass_over_a_group_has_minibatches_without_a_frame_of_a_rank():
     """The smallest of four shares has 128 of 896 frames: a minibatch of 32 has none of them about once in 140."""
     data = make_data(new_network(NetworkConfig(units=(16,))), 128)
-    share = Share(Group(0, 4), 0, 896)
+    share = Share(Group(0, 4), 0, 896, 1.0, False)
     generator = torch.Generator().manual_seed(0)
     counts = [len(part) for _ in range(20) for part, _ in minibatches(data, 32, generator, share)]
 
@@ -133,8 +157,9 @@ def test_an_incomplete_environment_is_refused(environment):
 
 
 def test_alone_nothing_is_summed_or_copied():
-    values, array = torch.ones(3), np.arange(4.0)
+    values, array = np.ones(3), np.arange(4.0)
     ALONE.add(values)
 
     assert values.tolist() == [1.0, 1.0, 1.0]
-    assert ALONE.gathered(array)[0] is array
+    assert ALONE.gathered(array)[0][0] is array
+    assert ALONE.of_leader(b"own") == b"own"

@@ -14,10 +14,8 @@ from services.learner.ppo import (
     LearningRate,
     UpdateMode,
     adapted_learning_rate,
-    bound_loss,
-    correction_loss,
     explained_variance,
-    policy_loss,
+    kl_sum,
     precision_of,
 )
 from services.learner.ppo import update as update_by
@@ -32,53 +30,6 @@ def update(network, optimizer, data, config, *arguments, **named):
         *arguments,
         **named,
     )
-
-
-def column(*values):
-    return torch.tensor(values, dtype=torch.float64)
-
-
-def test_the_loss_of_a_hand_worked_case():
-    # ratios 1.5 (clipped to 1.2), 0.5 (not clipped: the advantage is negative, and min takes 0.8), 1.1
-    log_prox = column(0.0, 0.0, 0.0)
-    log_new = torch.log(column(1.5, 0.5, 1.1))
-    advantages = column(2.0, -1.0, 3.0)
-
-    loss = policy_loss(log_new, log_prox, log_prox, advantages, clip=0.2)
-
-    # min(1.5*2, 1.2*2) = 2.4; min(0.5*-1, 0.8*-1) = -0.8; 1.1*3 = 3.3
-    assert float(loss) == pytest.approx(-(2.4 - 0.8 + 3.3) / 3)
-
-
-def test_old_data_are_weighted_by_how_likely_they_still_are_at_most_twice():
-    log_mu = column(0.0, 0.0)
-    log_prox = torch.log(column(0.5, 8.0))
-
-    loss = policy_loss(log_prox, log_prox, log_mu, column(1.0, 1.0), clip=0.2)
-
-    assert float(loss) == pytest.approx(-(0.5 + 2.0) / 2)
-
-
-def test_at_lag_0_decoupled_ppo_is_plain_ppo():
-    rng = np.random.default_rng(0)
-    log_mu = torch.from_numpy(rng.normal(size=200))
-    log_new = (log_mu + torch.from_numpy(rng.normal(size=200)) * 0.3).requires_grad_()
-    advantages = torch.from_numpy(rng.normal(size=200))
-
-    ratio = torch.exp(log_new - log_mu)
-    plain = -torch.min(ratio * advantages, torch.clamp(ratio, 0.8, 1.2) * advantages).mean()
-    decoupled = policy_loss(log_new, log_mu, log_mu, advantages, clip=0.2)
-
-    torch.testing.assert_close(decoupled, plain)
-    torch.testing.assert_close(
-        torch.autograd.grad(decoupled, log_new)[0], torch.autograd.grad(plain, log_new)[0]
-    )
-
-
-def test_the_loss_of_targets_beyond_the_joints_range_is_their_squared_excess():
-    mean = torch.tensor([[0.5, -1.0, 1.5], [-3.0, 0.0, 0.0]])
-
-    assert float(bound_loss(mean)) == pytest.approx((0.25 + 4.0) / 2)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +74,19 @@ def make_data(network, count=512, seed=0):
         nothing,
         log_std,
     )
+
+
+def test_the_divergence_is_the_gaussians():
+    generator = torch.Generator().manual_seed(0)
+    old, new = (torch.randn(7, generator=generator) * 0.3 - 1.0 for _ in range(2))
+    data = replace(make_data(new_network(NetworkConfig(units=(16,))), 64), log_std_prox=old)
+    mean = data.mean_prox + 0.2 * torch.randn(64, 7, generator=generator)
+    moved = (mean - data.mean_prox).double().square().sum(0).numpy()
+    p = torch.distributions.Normal(data.mean_prox.double(), old.double().exp())
+    q = torch.distributions.Normal(mean.double(), new.double().exp())
+
+    expected = float(torch.distributions.kl_divergence(p, q).sum())
+    assert kl_sum(data, moved, new) == pytest.approx(expected, rel=1e-5)
 
 
 def test_an_update_moves_the_policy_where_the_advantage_points_and_fits_the_value():
@@ -203,32 +167,6 @@ def make_corrections(count=512, share=0.2, seed=0):
     rng = np.random.default_rng(seed)
     rows = rng.uniform(size=(count, 1)) < share
     return torch.from_numpy((0.1 * rng.normal(size=(count, 7)) * rows).astype(np.float32))
-
-
-def test_the_correction_loss_is_half_the_mean_squared_distance_from_the_corrected_actions():
-    rng = np.random.default_rng(1)
-    mean, mean_prox = (torch.from_numpy(rng.normal(size=(50, 7))) for _ in range(2))
-    corrections = make_corrections(50).double()
-    total = 0.0
-    for row in range(50):
-        if any(corrections[row, joint] != 0 for joint in range(7)):
-            for joint in range(7):
-                wanted = mean_prox[row, joint] + corrections[row, joint]
-                total += 0.5 * float(mean[row, joint] - wanted) ** 2
-
-    assert 0 < int((corrections != 0).any(-1).sum()) < 50
-    assert float(correction_loss(mean, mean_prox, corrections)) == pytest.approx(total / 50)
-
-
-def test_rows_without_correction_have_no_gradient():
-    mean = torch.randn(50, 7, generator=torch.Generator().manual_seed(0)).requires_grad_()
-    corrections = make_corrections(50)
-    correction_loss(mean, torch.zeros(50, 7), corrections).backward()
-    silent = (corrections == 0).all(-1)
-
-    assert mean.grad is not None
-    assert (mean.grad[silent] == 0).all()
-    assert (mean.grad[~silent] != 0).all()
 
 
 def updated(corrections, weight, advantages=1.0, passes=2):
