@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
+import numpy as np
 import numpy.typing as npt
 import torch
 
@@ -66,14 +67,15 @@ make_player(make_training(PPOConfig(), 0), 256, 0).play("start", 1, 0)
 class Echo(Group):
     """A rank whose other ranks say what it says: what a rank computes in a large group, without the exchanges."""
 
-    def add(self, values: torch.Tensor) -> None:
+    def add(self, values: npt.NDArray[Any]) -> None:
         """Leave this rank's part of the sum."""
 
     def gathered(
-        self, array: npt.NDArray[Any], on_tick: Callable[[], None] | None = None
-    ) -> list[npt.NDArray[Any]]:
-        """Return this rank's array as everyone's."""
-        return [array] * self.size
+        self, *arrays: npt.NDArray[Any], on_tick: Callable[[], None] | None = None
+    ) -> list[list[npt.NDArray[Any]]]:
+        """Return this rank's arrays as everyone's."""
+        del on_tick
+        return [list(arrays)] * self.size
 
 
 def cpu_of(act: Callable[[], object], seconds: float) -> float:
@@ -241,7 +243,7 @@ def _add(rank: int, port: int, sizes: tuple[int, ...], result: Connection) -> No
     group = join({"RANK": str(rank), "WORLD_SIZE": "2"})
     found = {}
     for size in sizes:
-        values = torch.zeros(size)
+        values = np.zeros(size, np.float32)
         group.add(values)
         found[size] = statistics.median(seconds_of(partial(group.add, values)) for _ in range(SUMS))
     if rank == 0:

@@ -172,7 +172,7 @@ def estimate(plan: Plan, setting: Setting) -> float:
     training = opening + update + costs.publish_s
     small = gather_s(costs, network, plan.learners, 0.0)
     exchanging = steps * sum_s(costs, network, plan.learners, costs.gradient_bytes)
-    exchanging += (SMALL_EXCHANGES + 2 * plan.passes) * small
+    exchanging += (SMALL_EXCHANGES + plan.passes) * small
     exchanging += gather_s(costs, network, plan.learners, frames * VALUE_BYTES)
     hub = plan.actors * (costs.hub.of(size) + costs.policy_bytes * costs.hub_policy_byte_s)
     link = (

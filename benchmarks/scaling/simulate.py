@@ -35,10 +35,8 @@ TURN_WAIT_S: Final = 0.02  # services.learner.service
 RECOUNT_S: Final = 0.5  # services.learner.lockstep
 
 ROW_BYTES: Final = 8.0 * 9  # of a rank in a turn
-# Exchanges of an epoch that carry few numbers, in gatherings: the leader's decision about a checkpoint 4; sizes,
-# moments, counts and lags of the rollouts 7; the update's first and last sums 2 each. The KL divergence of each pass
-# takes 2 more.
-SMALL_EXCHANGES: Final = 15
+# Exchanges of an epoch that carry few numbers: the leader's decision about a checkpoint. Each pass has one more.
+SMALL_EXCHANGES: Final = 1
 VALUE_BYTES: Final = 8.0  # value and advantage of a frame, which every rank gets of all frames
 LONGEST_S: Final = 600.0  # virtual time without a dataset after which the run hangs
 
@@ -275,8 +273,7 @@ class _Run:
             learner.counted, learner.next_count = intake.contributors(now), now + RECOUNT_S
         meeting = self.meeting
         meeting.rows[learner.number] = Rank(intake.queued, *learner.counted, 0)
-        # Two gatherings: how much each rank says, and what
-        seconds = 2 * gather_s(self.costs, self.network, plan.learners, plan.learners * ROW_BYTES)
+        seconds = gather_s(self.costs, self.network, plan.learners, plan.learners * ROW_BYTES)
         yield from self._meet(learner, seconds, serves=True)
         ranks = [meeting.rows[number] for number in range(plan.learners)]
         intake.part = parts(ranks, plan.actors)[learner.number]
@@ -291,7 +288,7 @@ class _Run:
             yield from self._serve(learner)
         small = gather_s(costs, self.network, plan.learners, 0.0)
         values = gather_s(costs, self.network, plan.learners, plan.dataset * VALUE_BYTES)
-        yield from self._meet(learner, (SMALL_EXCHANGES + 2 * plan.passes) * small + values)
+        yield from self._meet(learner, (SMALL_EXCHANGES + plan.passes) * small + values)
         steps = plan.passes * plan.steps
         rows = plan.passes * len(dataset) * plan.rollout / steps
         step = costs.step.of(rows) + costs.whole_frame_s * plan.dataset / steps

@@ -20,7 +20,7 @@ from services.actor import service as actor_service
 from services.learner import lockstep
 from services.learner import service as learner_service
 from services.learner.group import Group
-from services.learner.ppo import Share, minibatches
+from services.learner.ppo import minibatches, whole
 from tests.unit.services.learner.rollouts import make_rollout
 from tests.unit.services.learner.test_ppo import make_data
 from tests.unit.services.learner.test_training import PPO, make_training
@@ -112,10 +112,10 @@ def test_a_learners_dataset_takes_what_its_parts_take():
 
 
 def test_two_ranks_halve_the_update_and_add_the_exchanges():
-    """16 steps of 2,048 frames each with a sum; 24 small gatherings and one of 8 bytes a frame; and the turn's two."""
+    """16 steps of 2,048 frames each with a sum; five small messages and one of 8 bytes a frame; and the turn's."""
     found = costs(play_s={256: 0.01}, exchange=Line(each=1e-3, per=1e-9), gradient_bytes=400_000)
     steps_s = 16 * (2048 * 5e-6 + 2 * (1e-3 + 200_000e-9))
-    others_s = (15 + 2 * 4) * 1e-3 + (1e-3 + 16384 * 8 / 2 * 1e-9) + 2 * (1e-3 + 72e-9)
+    others_s = (1 + 4) * 1e-3 + (1e-3 + 16384 * 8 / 2 * 1e-9) + (1e-3 + 72e-9)
     result = simulate(Plan(cores=64, actors=2, learners=2, minibatch=4096), found)
 
     assert result.frames_per_s == pytest.approx(16384 / (steps_s + others_s), rel=1e-4)
@@ -198,7 +198,7 @@ def test_the_pauses_are_those_of_the_services():
 def test_a_pass_has_as_many_gradient_steps_as_the_program_makes(minibatch):
     torch.manual_seed(0)
     data = make_data(make_training().network, count=256)
-    made = list(minibatches(data, minibatch, torch.Generator(), Share(Group(), 0, 256)))
+    made = list(minibatches(data, minibatch, torch.Generator(), whole(data)))
 
     assert Plan(cores=1, actors=1, envs=8, minibatch=minibatch).steps == len(made)
 
@@ -207,11 +207,15 @@ class Counting(Group):
     """A group that counts its exchanges."""
 
     def add(self, values):
-        self.seen["add", values.numel() > 10] += 1
+        self.seen["add", values.size > 10] += 1
 
-    def gathered(self, array, on_tick=None):
-        self.seen["gathered", array.ndim == 2 and len(array) > 100] += 1
-        return [array] * self.size
+    def gathered(self, *arrays, on_tick=None):
+        self.seen["gathered", any(len(array) > 100 for array in arrays)] += 1
+        return [list(arrays)] * self.size
+
+    def gathered_bytes(self, items, on_tick=None):
+        self.seen["gathered", False] += 1
+        return [list(items)] * self.size
 
 
 Counting.seen = Counter()
@@ -223,11 +227,10 @@ def test_an_epoch_has_the_exchanges_that_are_counted():
     training.run_epoch([make_rollout()])
     training.group.of_leader(b"")  # whether it saves
     seen, passes = Counting.seen, PPO.mini_epochs
-    # A gathering is one of sizes and one of values; a sum is two of these. Sums of gradients count apart.
-    small = 2 * seen["gathered", False] + seen["gathered", True] + 2 * seen["add", False]
+    small = seen["gathered", False] + seen["add", False]  # sums of gradients count apart
 
     assert seen["gathered", True] == 1  # the values of all frames
-    assert small == SMALL_EXCHANGES + 2 * passes
+    assert small == SMALL_EXCHANGES + passes
     assert seen["add", True] == passes * Plan(cores=1, actors=2, envs=4, minibatch=64, passes=2).steps
 
 
