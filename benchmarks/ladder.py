@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 from pydantic import Field
 
-from benchmarks.recipe import MEASURES, median, result
+from benchmarks.recipe import MEASURES, medians, result
 from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
 from common.service.process import DONE
@@ -129,9 +129,8 @@ def train(config: LadderConfig, rung: int, seed: int, stop: Event) -> None:
     folder = RunFolder.of(name)
     if folder.final.is_file():
         return
-    flags = ["--resume"] if folder.config.is_file() else ["--recipe", RECIPE, "--seed", str(seed)]
-    if "--resume" not in flags:
-        flags += ["--frames", str(config.frames), *flags_of(rung)]
+    new = ["--recipe", RECIPE, "--seed", str(seed), "--frames", str(config.frames), *flags_of(rung)]
+    flags = ["--resume"] if folder.config.is_file() else new
     command = [sys.executable, "-m", "topspin", "train", "--run", name, "--panel", "off", *flags]
     print(f"rung {rung}, seed {seed}: {RUNGS[rung].name}", file=sys.stderr, flush=True)
     done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
@@ -146,8 +145,7 @@ def figures(config: LadderConfig, rungs: Sequence[int]) -> list[dict[str, Any]]:
         names = [f"{config.run}-{rung}-{seed}" for seed in config.seeds]
         runs = [result(find(name)) for name in names if RunFolder.of(name).final.is_file()]
         if runs:
-            middle = {key: median(runs, key) for key in MEASURES}
-            found.append({"rung": rung, "name": RUNGS[rung].name, "runs": runs, "median": middle})
+            found.append({"rung": rung, "name": RUNGS[rung].name, "runs": runs, "median": medians(runs)})
     return found
 
 

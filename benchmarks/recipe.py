@@ -130,9 +130,7 @@ def rungs(folders: Sequence[RunFolder]) -> dict[str, Any]:
     for folder in folders:
         by_label.setdefault(label(read_toml(folder.config), known), []).append(result(folder))
     ladder = [
-        {"label": name, "runs": runs, "median": {key: median(runs, key) for key in MEASURES}}
-        for name, runs in by_label.items()
-        if runs
+        {"label": name, "runs": runs, "median": medians(runs)} for name, runs in by_label.items() if runs
     ]
     return {BASE: by_label[BASE], "ladder": ladder}
 
@@ -141,6 +139,11 @@ def median(runs: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Return the median of one measure over the runs that have it, or None."""
     values = [run[key] for run in runs if run[key] is not None]
     return round(statistics.median(values), 4) if values else None
+
+
+def medians(runs: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
+    """Return the median of each measure over the runs."""
+    return {key: median(runs, key) for key in MEASURES}
 
 
 def main(config: RecipeConfig, stop: Event) -> int:

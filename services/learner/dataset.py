@@ -21,7 +21,7 @@ from services.learner.group import ALONE, Group
 from services.learner.ppo import Dataset, Share, are_any, denormalized, explained_variance, weight_sum
 
 Floats = npt.NDArray[np.float32]
-COLUMNS: Final = (
+OF_PARTS: Final = (
     "obs",
     "actions",
     "log_mu",
@@ -112,7 +112,7 @@ def read(
         on_tick()
     parts = parts or [_nothing(model)]
     group = model.group
-    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in COLUMNS}
+    columns = {name: torch.cat([getattr(part, name) for part in parts]) for name in OF_PARTS}
     own = np.concatenate([np.stack((part.values, part.advantages), axis=1) for part in parts])
     # One message has all that a rank must know of another's rollouts
     told = group.gathered(

@@ -37,7 +37,6 @@ from services.learner.places import Registrar
 from services.learner.reception import Reception, in_order, lives, new_intake, where
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
-from services.learner.start_policy import start_policy
 from services.learner.training import new_training
 
 log = logging.getLogger(__name__)
@@ -100,9 +99,10 @@ class LearnerService:
                 "go on with --resume, or choose another --run"
             )
         task, teacher = config.task, config.experience.teacher
-        if not config.resume:  # before a folder is made
+        # Before a folder is made: teacher and start policy may not fit
+        if not config.resume:
             teacher_of(task, teacher)
-            start_policy(config)
+        self.training = new_training(config, group)
         self._folder.create()
         writers = own_writers(config.writers, config.run, self._folder.root)
         self._run_log = RunLog(
@@ -110,7 +110,6 @@ class LearnerService:
         )
         self._dataset_rollouts = config.intake.for_actors(config.actors).dataset_rollouts
         self._lockstep = Lockstep(group, self._dataset_rollouts, transport.wait)
-        self.training = new_training(config, group)
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
         self._history = History(config.history, "learner-0")

@@ -39,7 +39,7 @@ def misfits(config: "LearnerConfig", contract: Contract) -> Iterator[tuple[str, 
     theirs, own = contract.task, config.task
     if config.network.units != contract.network.units:
         yield "network.units", _text(config.network.units), _text(contract.network.units)
-    for name in type(own.observation).model_fields.keys() - MAY_DIFFER:
+    for name in (field for field in type(own.observation).model_fields if field not in MAY_DIFFER):
         ours, wanted = getattr(own.observation, name), getattr(theirs.observation, name)
         if ours != wanted:
             yield f"task.observation.{name}", _text(ours), _text(wanted)
