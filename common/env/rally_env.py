@@ -371,8 +371,13 @@ class RallyEnv:
         )
 
     def _begin(self, rows: Rows, same_episode: Flags) -> None:
-        """Launch the next rallies on ``rows``. Where ``same_episode`` the robot starts where it is."""
+        """Launch the next rallies on ``rows``. Where ``same_episode`` the robot starts where it is.
+
+        In another episode it starts there in a share ``carry_over`` of those after a stroke that was played to its end.
+        """
         new = self._source.take(rows)
+        # The stroke of a rally that ended at its hit is not finished: no robot meets its next ball in mid-swing.
+        is_cut = self._rallies.ends_at_hit[rows] & self._rallies.caught[rows]
         path = self._rallies.true_sample_ring[:, RING:]
         path[rows] = NO_SAMPLE if new.paths is None else new.paths
         if new.strangers is not None and len(self._rallies.track):
@@ -389,7 +394,7 @@ class RallyEnv:
             new.seeds, self._profile, task.carry_over, task.reset_spread, gains, offset
         )
         self.robot.set_gains(rows, gains, self._rallies.parameters[rows, RallyParameter.ACTION_LATENCY])
-        leaves = ~(stays & self._started) & ~same_episode
+        leaves = ~(stays & self._started & ~is_cut) & ~same_episode
         home = rows[leaves]
         if home.size:
             self.robot.go_home(home, offset[leaves])

@@ -164,6 +164,27 @@ def test_the_share_carry_over_of_episodes_begins_where_the_last_stroke_left_the_
     assert low <= np.mean(stayed) <= high
 
 
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_no_robot_meets_its_next_ball_in_the_mid_swing_of_an_episode_that_was_cut_at_its_hit(share):
+    experience = PLAYED_OUT.model_copy(update={"end_at_hit_share": share})
+    env = make_env(2, QUIET.model_copy(update={"carry_over": 1.0}), experience)
+    env.reset()
+    aside = hold(env)
+    aside[:, 1] = 0.5
+    for _ in range(10):
+        env.step(aside)
+    drop_on(env, 0.7, row=0)
+    left: dict[int, float] = {}  # how far from home each row's next episode begins
+    while len(left) < 2:
+        step = env.step(aside)
+        for row in step.ended:
+            left.setdefault(int(row), np.abs(env.robot.joint_pos[row, 1] - env.robot.home[1]))
+
+    # row 0 hit its ball and row 1 missed it: that rally was played to its end
+    assert left[1] > 0.1
+    assert left[0] == 0.0 if share else left[0] > 0.1
+
+
 def test_robots_that_start_at_home_are_within_the_reset_spread():
     env = make_env(64, QUIET.model_copy(update={"reset_spread": 0.1}), rallies=64)
     env.reset()
