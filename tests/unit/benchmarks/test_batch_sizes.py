@@ -1,0 +1,64 @@
+"""Which trainings a size of datasets needs, and that what is measured stays."""
+
+import json
+from threading import Event
+
+import pytest
+
+from benchmarks import batch_sizes
+from benchmarks.batch_sizes import BatchSizesConfig, flags_of, main, missing
+from benchmarks.scaling.large_batches import Point, read
+from common.errors import ReportedError
+from deploy.config import settings
+
+SIZES = (8192, 32_768, 131_072, 524_288)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_flags_make_datasets_of_the_size_in_messages_of_64_mib_at_most(size):
+    config = settings(("--run", "r", *flags_of(size)), "p")
+    rollout = config.actor.envs * config.actor.horizon
+
+    assert config.actors * rollout == size
+    assert 400 * rollout < 64 * 2**20  # a frame has fewer bytes
+
+
+@pytest.mark.parametrize("size", [0, 8200, 600_001])
+def test_a_size_that_is_no_whole_number_of_rollouts_is_refused(size):
+    with pytest.raises(ReportedError, match=f"^dataset of {size} frames; allowed: a multiple of "):
+        flags_of(size)
+
+
+def test_all_sizes_have_their_first_seed_before_one_has_its_second():
+    config = BatchSizesConfig(sizes=(8192, 32_768), seeds=(3, 4))
+    points = (Point(dataset=32_768, frames=None, seed=3),)
+
+    assert missing(config, points) == [(8192, 3), (8192, 4), (32_768, 4)]
+
+
+def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, monkeypatch, capsys):
+    stop, asked = Event(), []
+
+    def train(config, name, seed, stopped):
+        asked.append((name, seed, config.more))
+        if len(asked) == 3:
+            stopped.set()  # Ctrl-C in the third
+        return {"reached": len(asked) == 1, "frames": 9_000_000}
+
+    monkeypatch.setattr(batch_sizes, "train", train)
+    config = BatchSizesConfig(
+        sizes=(8192, 32_768), run="b", frames=20_000_000, out=tmp_path / "found.json", json_line=True
+    )
+    main(config, stop)
+    first = read(config.out).points
+    main(config, Event())
+
+    assert [name for name, _, _ in asked] == ["b-8192-0", "b-32768-0", "b-8192-1", "b-8192-1", "b-32768-1"]
+    assert asked[0][2] == "--actors 2 --actor.envs 128 --actor.horizon 32 --frames 20000000"
+    assert first == (
+        Point(dataset=8192, frames=9_000_000, seed=0),
+        Point(dataset=32_768, frames=None, seed=0),  # it trained to its end
+    )
+    assert len(read(config.out).points) == 4
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert [point["dataset"] for point in printed["points"]] == [8192, 32_768, 8192, 32_768]
