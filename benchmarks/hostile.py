@@ -135,7 +135,7 @@ def deploy_config(tls: str, number: int) -> DeployConfig:
         actor=ActorOptions(envs=32, horizon=16),
         learner=LearnerOptions(
             ppo=PPOConfig(minibatch=256, refit_epochs=1),
-            curriculum=CurriculumConfig(stage_1=10**6, stage_2=1, stage_3=1),
+            curriculum=CurriculumConfig(stage_1=10**9),
         ),
     )
 

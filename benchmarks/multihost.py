@@ -103,7 +103,7 @@ class Site:
                 "checkpoint_interval_s": 3.0,
                 "intake": {"max_lag": MAX_LAG},
                 "ppo": {"minibatch": 256, "refit_epochs": 1},
-                "curriculum": {"stage_1": 150, "stage_2": 150, "stage_3": 10**6},
+                "curriculum": {"stage_1": 150_000, "stage_2": 150_000, "stage_3": 10**12},
             },
             "actor": {"history": str(self.history), "envs": ENVS, "horizon": HORIZON},
             "evaluator": {"rallies": 20, "envs": 10, "interval_s": 2.0},

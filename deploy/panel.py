@@ -66,13 +66,12 @@ def share_done(view: View) -> float:
     if learner is None:
         return 0.0
     gauges = learner.gauges
-    epochs = gauges.get("epochs", 0.0)  # 0: the curriculum's stages are shares of the frames
-    shares = [gauges.get("epoch", 0.0) / epochs if epochs > 0 else 0.0]
-    if view.minutes > 0:
-        shares.append(gauges.get("seconds", 0.0) / (60.0 * view.minutes))
-    if view.frames > 0:
-        shares.append(learner.counters.get("frames", 0.0) / view.frames)
-    return min(max(shares), 1.0)
+    limits = (
+        (gauges.get("seconds", 0.0), 60.0 * view.minutes),
+        (learner.counters.get("frames", 0.0), view.frames),
+        (learner.counters.get("frames", 0.0), gauges.get("curriculum_frames", 0.0)),
+    )
+    return min(max((done / limit for done, limit in limits if limit > 0), default=0.0), 1.0)
 
 
 def time_left_s(view: View) -> float | None:

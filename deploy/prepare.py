@@ -59,8 +59,8 @@ class PreparedRun:
         """Return the limit that the run reached with its epoch ``last``, a row of metrics.csv, or ""."""
         if not last:
             return ""
-        budget = Budget(self.config.learner.curriculum.epochs, self.config.frames, self.config.minutes)
-        return budget.spent(int(last["epoch"]), int(last["frames"]), float(last["seconds"]), ENDING_S)
+        budget = Budget(self.config.learner.curriculum.frames, self.config.frames, self.config.minutes)
+        return budget.spent(int(last["frames"]), float(last["seconds"]), ENDING_S)
 
     def specs(self) -> list[Spec]:
         """Return the processes of the run: its topology, as one function."""

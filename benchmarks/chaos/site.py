@@ -38,8 +38,8 @@ SMALL: Final = (
     *NETWORK,
     *("--actor.envs", "16", "--actor.horizon", "16"),
     *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-epochs", "1"),
-    *("--learner.curriculum.stage-1", "150", "--learner.curriculum.stage-2", "150"),
-    *("--learner.curriculum.stage-3", "1000000"),
+    *("--learner.curriculum.stage-1", "150000", "--learner.curriculum.stage-2", "150000"),
+    *("--learner.curriculum.stage-3", str(10**12)),
     *("--evaluator.rallies", "20", "--evaluator.envs", "10", "--evaluator.interval-s", "2"),
 )
 FAR_LINK: Final = f"10.213.{os.getpid() % 256}"  # begin of the addresses of the far host's cable

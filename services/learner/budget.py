@@ -35,22 +35,26 @@ class BudgetConfig(BaseModel):
 class Budget:
     """The limits that end a run."""
 
-    datasets: int | None  # of the whole curriculum; None: no limit
+    curriculum: int | None  # frames of all its stages; None: no limit
     frames: int  # 0: no limit
     minutes: float  # since the first trained batch; 0: no limit
 
-    def spent(self, datasets: int, frames: int, seconds: float, slack_s: float = 0.0) -> str:
+    def spent(self, frames: int, seconds: float, slack_s: float = 0.0) -> str:
         """Return the limit that is reached, such as "10 of 10 minutes", or "".
 
         Args:
-            datasets: Trained so far.
             frames: Trained so far.
             seconds: Since the first trained batch [s].
             slack_s: The minutes count as reached this long before their end [s].
         """
         limits = (
-            ("datasets", datasets, math.inf if self.datasets is None else self.datasets, 0.0),
             ("frames", frames, self.frames or math.inf, 0.0),
+            (
+                "frames of the curriculum",
+                frames,
+                math.inf if self.curriculum is None else self.curriculum,
+                0.0,
+            ),
             ("minutes", seconds / 60.0, self.minutes or math.inf, slack_s / 60.0),
         )
         return next(

@@ -86,17 +86,23 @@ class PPOConfig(BaseModel):
 
 
 class CurriculumConfig(BaseModel):
-    """Lengths of the stages, in epochs (one dataset and its updates) or in shares of the run's frames."""
+    """Lengths of the stages, in frames or in shares of the run's frames. A stage ends with a dataset."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    stage_1: int = Field(244, ge=0, description="epochs of stage 1, catching (2 M frames of 8,192 an epoch)")
-    stage_2: int = Field(122, ge=0, description="epochs of stage 2, hitting (1 M frames)")
-    stage_3: int = Field(14282, ge=0, description="epochs of stage 3, aiming (117 M frames)")
+    stage_1: int = Field(
+        2_000_000, ge=0, description="length of stage 1, catching", json_schema_extra={"unit": "frames"}
+    )
+    stage_2: int = Field(
+        1_000_000, ge=0, description="length of stage 2, hitting", json_schema_extra={"unit": "frames"}
+    )
+    stage_3: int = Field(
+        117_000_000, ge=0, description="length of stage 3, aiming", json_schema_extra={"unit": "frames"}
+    )
     stage_shares: tuple[float, ...] = Field(
         (),
-        description="three shares of the frames of the run (--frames) for stages 1, 2 and 3, in place of their epochs; "
-        "empty: the epochs count",
+        description="three shares of the frames of the run (--frames) for stages 1, 2 and 3, in place of their "
+        "lengths; empty: the lengths count",
     )
     first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
     catch_gate: float = Field(
@@ -135,8 +141,8 @@ class CurriculumConfig(BaseModel):
             raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
 
     @property
-    def epochs(self) -> int | None:
-        """Return the epochs of all stages from the first one; None: shares of the frames decide."""
+    def frames(self) -> int | None:
+        """Return the frames of all stages from the first one; None: the stages are shares of the run's frames."""
         if self.stage_shares:
             return None
         return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])

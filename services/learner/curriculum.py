@@ -16,14 +16,14 @@ class Trained:
     """How much is trained."""
 
     stage: int
-    epochs_in_stage: int
+    began: int  # frames at which the present stage began
     epochs: int  # of the whole run
     frames: int
 
 
 @dataclass(frozen=True, slots=True)
 class StageLengths:
-    """How long the stages of one run are.
+    """How long the stages of one run are, in frames.
 
     Args:
         config: Lengths and gates.
@@ -33,25 +33,26 @@ class StageLengths:
     config: CurriculumConfig
     frames: int = 0
 
-    def ends(self) -> tuple[int, ...]:
-        """Return the frames at which each stage ends; stages before the first one give their share to the others."""
+    def lengths(self) -> tuple[int, ...]:
+        """Return the frames of each stage; shares of stages before the first one go to the others."""
         config = self.config
-        shares = [
-            0.0 if stage < config.first_stage else share for stage, share in enumerate(config.stage_shares, 1)
-        ]
-        # rounded: 0.14 of 10,000 is 1,400.0000000000002, which would take one more dataset
-        return tuple(
-            round(self.frames * sum(shares[:stage]) / sum(shares)) for stage in range(1, LAST_STAGE + 1)
+        wanted: tuple[float, ...] = config.stage_shares or (config.stage_1, config.stage_2, config.stage_3)
+        wanted = tuple(
+            0.0 if stage < config.first_stage else length for stage, length in enumerate(wanted, 1)
         )
+        scale = self.frames / sum(wanted) if config.stage_shares else 1.0
+        # rounded: 0.14 of 10,000 is 1,400.0000000000002, which would take one more dataset
+        return tuple(round(scale * length) for length in wanted)
+
+    def end(self, trained: Trained) -> int:
+        """Return the frames at which the present stage ends: the last one also takes what a gate saved."""
+        lengths = self.lengths()
+        return sum(lengths) if trained.stage == LAST_STAGE else trained.began + lengths[trained.stage - 1]
 
     def gone(self, trained: Trained) -> float:
         """Return the share of the present stage that is trained; 1 or more: it is over."""
-        config = self.config
-        if config.stage_shares:
-            start, end = (0, *self.ends())[trained.stage - 1 : trained.stage + 1]
-            return (trained.frames - start) / (end - start) if end > start else 1.0
-        length = (config.stage_1, config.stage_2, config.stage_3)[trained.stage - 1]
-        return trained.epochs_in_stage / max(length, 1)
+        length = self.end(trained) - trained.began
+        return (trained.frames - trained.began) / length if length > 0 else 1.0
 
     def next_stage(self, trained: Trained, catch_rate: float) -> int:
         """Return the stage of the next epoch.
@@ -67,21 +68,15 @@ class StageLengths:
 
     def after(self, stage: int) -> int:
         """Return the stage that follows ``stage``, which is 1 or 2: a stage 2 of no length is left out."""
-        length = self.config.stage_shares[1] if self.config.stage_shares else self.config.stage_2
-        return 2 if stage == 1 and length > 0 else LAST_STAGE
+        return 2 if stage == 1 and self.lengths()[1] > 0 else LAST_STAGE
 
     def datasets_left(self, trained: Trained) -> int:
         """Return how many datasets the present stage still takes, at least 1.
 
-        With shares, future datasets count as large as those so far; before the first one it is 1.
+        Future datasets count as large as those so far; before the first one it is 1.
         """
-        config = self.config
-        if config.stage_shares:
-            left = self.ends()[trained.stage - 1] - trained.frames
-            return max(1, math.ceil(left * trained.epochs / trained.frames)) if trained.frames else 1
-        if trained.stage == LAST_STAGE:  # it also takes the epochs that a gate saved
-            return max(1, (config.epochs or 0) - trained.epochs)
-        return max(1, (config.stage_1, config.stage_2)[trained.stage - 1] - trained.epochs_in_stage)
+        left = self.end(trained) - trained.frames
+        return max(1, math.ceil(left * trained.epochs / trained.frames)) if trained.frames else 1
 
     def learning_rate_bound(self, trained: Trained, highest: float, lowest: float) -> float:
         """Return the learning rate's upper bound: constant, then linear to ``lowest`` over the last stage."""

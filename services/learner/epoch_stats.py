@@ -24,6 +24,7 @@ class Progress:
     stage: int = 1
     stage_number: int = 0  # stage changes so far
     epochs_in_stage: int = 0
+    began: int = 0  # frames at which the stage began
     learning_rate: float = 5e-4
     catch_rate: float = float("nan")  # running, with exploration noise
     refitting: bool = False  # after a stage change the critic learns the new rewards first
@@ -35,7 +36,7 @@ class Progress:
     @property
     def trained(self) -> Trained:
         """How much is trained, as the curriculum counts it."""
-        return Trained(self.stage, self.epochs_in_stage, self.epoch, self.frames)
+        return Trained(self.stage, self.began, self.epoch, self.frames)
 
     @property
     def is_worth_going_back_to(self) -> bool:

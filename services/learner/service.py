@@ -179,8 +179,8 @@ class LearnerService:
     def _spent(self, seconds: float, slack_s: float = 0.0) -> str:
         """Return the limit that is reached after so many seconds of training, or ""."""
         config, progress = self._config, self.training.progress
-        budget = Budget(config.curriculum.epochs, config.frames, config.minutes)
-        return budget.spent(progress.epoch, progress.frames, seconds, slack_s)
+        budget = Budget(config.curriculum.frames, config.frames, config.minutes)
+        return budget.spent(progress.frames, seconds, slack_s)
 
     def ledger(self) -> Ledger:
         """Return the ledger of all actors together."""
@@ -192,13 +192,13 @@ class LearnerService:
         """Train until the budget is spent or ``stop`` is set; the run folder is complete afterwards."""
         config = self._config
         log.info(
-            "%s endpoint=%s run=%s epoch=%d of=%s; waiting for actors, start one with: python -m services.actor "
+            "%s endpoint=%s run=%s frames=%d of=%s; waiting for actors, start one with: python -m services.actor "
             "--run %s %s (and rallies with: python -m services.generator --run %s %s)",
             "listening" if config.mode == "hub" else "connected",
             config.endpoint,
             config.run,
-            self.training.progress.epoch,
-            config.curriculum.epochs,
+            self.training.progress.frames,
+            config.frames or config.curriculum.frames,
             *(config.run, self._link) * 2,
         )
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
@@ -423,7 +423,7 @@ class LearnerService:
         is_alone = self._group.size == 1  # a group's sums are those of its last turn
         counters, gauges = telemetry.heartbeat(
             self.training.progress,
-            self._config.curriculum.epochs or 0,
+            self._config.curriculum.frames or 0,
             self.seconds,
             telemetry.fates(ledger) if is_alone else self._lockstep.fates,
             self._intake.queued if is_alone else self._lockstep.queued,

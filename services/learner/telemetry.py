@@ -107,7 +107,7 @@ def measure_state(metrics: Metrics, ledger: Ledger, intake: Intake, alive: Itera
 
 def heartbeat(
     progress: Progress,
-    epochs: int,
+    curriculum: int,
     seconds: float,
     counts: Mapping[str, int],
     queued: int,
@@ -117,7 +117,7 @@ def heartbeat(
 
     Args:
         progress: Of training.
-        epochs: Of the whole curriculum; 0: its stages are shares of the frames.
+        curriculum: Frames of the whole curriculum; 0: its stages are shares of the run's frames.
         seconds: Training time, through restarts [s].
         counts: The ledger of all actors, by fate.
         queued: Rollouts that wait for an update.
@@ -126,7 +126,7 @@ def heartbeat(
     counters = {"frames": float(progress.frames)} | {k: float(v) for k, v in counts.items()}
     gauges = {
         "epoch": progress.epoch,
-        "epochs": epochs,
+        "curriculum_frames": curriculum,
         "version": progress.version,
         "stage": progress.stage,
         "queued": queued,

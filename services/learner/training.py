@@ -202,9 +202,7 @@ class Training:
         play = batch.play
         running = running_mean(before.catch_rate, play.catch_rate)
         # The gate is left out here: when it opens, rollouts of this stage are in flight, and are trained on first.
-        trained = Trained(
-            before.stage, before.epochs_in_stage + 1, before.epoch + 1, before.frames + batch.frames
-        )
+        trained = Trained(before.stage, before.began, before.epoch + 1, before.frames + batch.frames)
         stage, due = (self.stages.next_stage(trained, rate) for rate in (float("nan"), running))
         closing = before.closing - 1 if before.closing else self.notice if due != stage else 0
         if before.closing == 1:
@@ -221,7 +219,8 @@ class Training:
             frames=trained.frames,
             stage=stage,
             stage_number=before.stage_number + changed,
-            epochs_in_stage=0 if changed else trained.epochs_in_stage,
+            epochs_in_stage=0 if changed else before.epochs_in_stage + 1,
+            began=trained.frames if changed else before.began,
             learning_rate=before.learning_rate if is_refitting else stats.learning_rate,
             refitting=changed or is_refitting,
             catch_rate=running,

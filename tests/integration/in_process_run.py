@@ -24,9 +24,10 @@ from services.learner.service import LearnerService
 
 NETWORK = NetworkConfig(units=(32, 16))
 PPO = PPOConfig(minibatch=128, mini_epochs=2, refit_epochs=1)
-CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=3)
 ENVS, HORIZON = 16, 16
-LONG = CURRICULUM.model_copy(update={"stage_3": 500})
+DATASET = 2 * ENVS * HORIZON  # frames
+CURRICULUM = CurriculumConfig(stage_1=3 * DATASET, stage_2=2 * DATASET, stage_3=3 * DATASET)
+LONG = CURRICULUM.model_copy(update={"stage_3": 500 * DATASET})
 
 
 def free_endpoint():

@@ -12,7 +12,7 @@ from common.comms.transport import Flow, NoReply
 from common.policy.weights import load_tensors, save_tensors
 from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION
-from tests.integration.in_process_run import CURRICULUM, local_run
+from tests.integration.in_process_run import CURRICULUM, DATASET, local_run
 from tests.unit.comms.test_codec import sealed
 from tests.unit.services.learner.rollouts import make_rollout
 from tests.waiting import wait_until
@@ -20,7 +20,7 @@ from tests.waiting import wait_until
 KEYS = Keys("test")
 REPORT = ActorReport("test", "client", 1, 0, 0, (), (), 0, (), leaving=False)
 PAPER = TaskConfig(observation=PAPER_OBSERVATION)  # the task of the client's rollouts
-LONG = CURRICULUM.model_copy(update={"stage_1": 500})
+LONG = CURRICULUM.model_copy(update={"stage_1": 500 * DATASET})
 
 
 class ForeignClient:

@@ -19,7 +19,7 @@ from services.actor.rally_feed import NoRalliesError
 from services.learner.checkpoint import CheckpointError
 from services.learner.config import IntakeConfig
 from services.learner.service import RunExistsError
-from tests.integration.in_process_run import CURRICULUM, LONG, free_endpoint, local_run, progress
+from tests.integration.in_process_run import CURRICULUM, DATASET, LONG, free_endpoint, local_run, progress
 from tests.waiting import wait_until
 
 SYNCHRONOUS = {"intake": IntakeConfig(dataset_rollouts=2, max_lag=0)}
@@ -44,7 +44,7 @@ def assert_same_state(one, other):
 
 
 def test_an_actor_that_starts_late_gets_policy_and_stage_and_takes_part(tmp_path):
-    with local_run(tmp_path, curriculum=CURRICULUM.model_copy(update={"stage_2": 500})) as s:
+    with local_run(tmp_path, curriculum=CURRICULUM.model_copy(update={"stage_2": 500 * DATASET})) as s:
         learner = s.learner()
         s.generator()
         first = s.actor(0)
@@ -257,9 +257,7 @@ def test_a_seeded_synchronous_run_is_reproducible_bit_for_bit(tmp_path):
 
 
 def test_a_gate_ends_a_stage_early_and_no_accepted_rollout_is_lost(tmp_path):
-    curriculum = CURRICULUM.model_copy(
-        update={"stage_1": 400, "stage_2": 4, "stage_3": 4, "catch_gate": 1e-6}
-    )
+    curriculum = CURRICULUM.model_copy(update={"stage_1": 400 * DATASET, "catch_gate": 1e-6})
     with local_run(tmp_path, curriculum=curriculum, frames=20_000) as s:
         learner = s.learner()
         s.generator()
@@ -372,7 +370,7 @@ def test_an_evaluator_of_another_task_refuses_the_policy_as_actors_do(tmp_path, 
 
 
 def test_an_actor_that_runs_out_of_rallies_logs_it_once(tmp_path, caplog):
-    curriculum = CURRICULUM.model_copy(update={"stage_1": 40, "stage_2": 0, "stage_3": 0})
+    curriculum = CURRICULUM.model_copy(update={"stage_1": 40 * DATASET, "stage_2": 0, "stage_3": 0})
     with caplog.at_level(logging.INFO), local_run(tmp_path, curriculum=curriculum) as s:
         s.learner()
         s.generator(shards=1, batch=16, rate_hz=0.1)  # enough for the start, and then none

@@ -9,7 +9,7 @@ from safetensors.numpy import load_file
 
 from services.learner.checkpoint import checkpoints
 from services.learner.service import DivergedError
-from tests.integration.in_process_run import LONG, local_run, progress
+from tests.integration.in_process_run import DATASET, LONG, local_run, progress
 from tests.waiting import wait_until
 
 
@@ -36,7 +36,7 @@ def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
         learner = s.learner()
         s.generator()
         s.actor(0, shards=1)
-        begun = LONG.stage_1 + LONG.stage_2
+        begun = (LONG.stage_1 + LONG.stage_2) // DATASET
         wait_until(lambda: progress(learner).epoch > begun, 60, "stage 3")
         kept = [path.stem for path in checkpoints(tmp_path / "checkpoints" / "good")]
 

@@ -10,7 +10,7 @@ import torch
 from common.policy.folder import load_policy
 from common.task.experience import ExperienceConfig
 from services.learner.config import CurriculumConfig
-from tests.integration.in_process_run import CURRICULUM, PPO, local_run
+from tests.integration.in_process_run import CURRICULUM, DATASET, PPO, local_run
 from tests.unit.env.teachers import write_teacher
 from tests.waiting import wait_until
 
@@ -64,7 +64,9 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
 def test_a_run_with_the_papers_switches_changes_stages_by_frames_and_saves_its_newest_weights(tmp_path):
     curriculum = CurriculumConfig(stage_shares=(0.375, 0.25, 0.375), count_reset="raw")
     ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_epochs": 0})
-    with local_run(tmp_path, curriculum=curriculum, ppo=ppo, frames=8 * 512, evaluated_weights="newest") as s:
+    with local_run(
+        tmp_path, curriculum=curriculum, ppo=ppo, frames=8 * DATASET, evaluated_weights="newest"
+    ) as s:
         learner = s.learner()
         generator, actors, evaluator = s.generator(), [s.actor(0), s.actor(1)], s.evaluator()
         learner.join(60)
@@ -87,7 +89,7 @@ def test_a_run_with_the_papers_switches_changes_stages_by_frames_and_saves_its_n
 def test_a_run_with_a_teacher_imitates_it_first_and_then_learns_from_rewards(tmp_path):
     teacher = write_teacher(tmp_path / "teacher").model_copy(update={"epochs": 3})
     experience = ExperienceConfig(teacher=teacher)
-    curriculum = CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6})
+    curriculum = CURRICULUM.model_copy(update={"first_stage": 3, "stage_3": 6 * DATASET})
     with local_run(tmp_path / "run", curriculum=curriculum) as s:
         learner = s.learner(experience=experience)
         generator, actors = s.generator(), [s.actor(k, experience=experience) for k in range(2)]

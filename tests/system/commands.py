@@ -19,7 +19,10 @@ TINY = [
     *("--evaluator.rallies", "20", "--evaluator.envs", "10", "--evaluator.interval-s", "1"),
     *("--final-rallies", "40", "--panel", "off", "--json"),
 ]
-STAGES = ["--learner.curriculum.stage-1", "3", "--learner.curriculum.stage-2", "2"]
+DATASET = 2 * 32 * 16  # frames of a dataset of two such actors
+STAGES = [
+    *("--learner.curriculum.stage-1", str(3 * DATASET), "--learner.curriculum.stage-2", str(2 * DATASET)),
+]
 
 
 @dataclass

@@ -31,7 +31,7 @@ def test_a_run_is_watched(tmp_path):
 
     assert "topspin train writes it" in example(tmp_path, "watch_run.py", "r").stderr
     with running(
-        tmp_path, "deploy.local", "--run", "r", *TINY, *STAGES, "--learner.curriculum.stage-3", 100_000
+        tmp_path, "deploy.local", "--run", "r", *TINY, *STAGES, "--learner.curriculum.stage-3", 10**9
     ):
         wait_until(is_ready, 60, "all services to be ready")
         rows = example(tmp_path, "watch_run.py", "r").stdout.splitlines()

@@ -26,8 +26,8 @@ def test_a_group_of_learners_trains_dies_and_goes_on(tmp_path):
         return {child.environ()["RANK"]: child for child in found if "RANK" in child.environ()}
 
     flags = ("--run", "r", "--learners", 2, "--actors", 3, *TINY, "--evaluate", "false")
-    stages = ("--learner.curriculum.stage-1", 2, "--learner.curriculum.stage-2", 1)
-    ends = ("--learner.curriculum.stage-3", 100_000, "--learner.checkpoint-interval-s", 0.2)
+    stages = ("--learner.curriculum.stage-1", 3000, "--learner.curriculum.stage-2", 1000)
+    ends = ("--learner.curriculum.stage-3", 10**9, "--learner.checkpoint-interval-s", 0.2)
     history = ("--actor.history", tmp_path / "history", "--learner.history", tmp_path / "history")
     with running(tmp_path, "deploy.local", *flags, *stages, *ends, *history) as command:
         wait_until(

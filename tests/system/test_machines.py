@@ -5,7 +5,8 @@ import shutil
 from tests.no_links import refuse_links, skip_without_filter
 from tests.system.commands import TINY, last_json, run
 
-STAGES = ["--learner.curriculum.stage-1", "1", "--learner.curriculum.stage-2", "1"]
+DATASET = 16 * 32  # frames
+STAGES = ["--learner.curriculum.stage-1", str(DATASET), "--learner.curriculum.stage-2", str(DATASET)]
 FLAGS = ["--run", "r", *TINY, *STAGES, "--final-rallies", "10"]
 SOMEBODYS = {
     "PYTHONWARNINGS": "error",
@@ -21,7 +22,7 @@ SOMEBODYS = {
 def test_a_run_on_a_file_system_without_links_is_copied_as_plain_files_and_goes_on(tmp_path):
     skip_without_filter()
     how = {"environ": SOMEBODYS, "before": refuse_links}
-    status, _, err = run(tmp_path, "deploy.local", *FLAGS, "--learner.curriculum.stage-3", 1, **how)
+    status, _, err = run(tmp_path, "deploy.local", *FLAGS, "--learner.curriculum.stage-3", DATASET, **how)
 
     assert status == 0, err
     assert "no link to the newest run" in err
@@ -31,8 +32,17 @@ def test_a_run_on_a_file_system_without_links_is_copied_as_plain_files_and_goes_
     copy = tmp_path / "copy"
     shutil.copytree(tmp_path / "runs", copy / "runs")
     shutil.copytree(copy / "runs" / "r", copy / "runs" / "latest")  # as a copy that followed the link
-    resumed = ["--run", "r", "--resume", "--learner.curriculum.stage-3", 2, "--evaluate", "false", "--json"]
+    resumed = [
+        "--run",
+        "r",
+        "--resume",
+        "--learner.curriculum.stage-3",
+        2 * DATASET,
+        "--evaluate",
+        "false",
+        "--json",
+    ]
     status, out, err = run(copy, "deploy.local", *resumed, **how)
 
     assert status == 0, err
-    assert last_json(out)["frames"] == 4 * 16 * 32
+    assert last_json(out)["frames"] == 4 * DATASET

@@ -122,7 +122,7 @@ def test_every_target_is_up_every_expression_has_data_and_an_alarm_stands_when_i
     expressions = [text.replace("$run", "r") for text in panels.expressions()]
     expressions += [alarm.signal for alarm in alarms.ALARMS] + [alarms.WAIT_SHARE]
     with (
-        running(tmp_path, "deploy.local", *flags, "--learner.curriculum.stage-3", 100_000),
+        running(tmp_path, "deploy.local", *flags, "--learner.curriculum.stage-3", 10**9),
         prometheus_of(tmp_path) as api,
     ):
         wait_until(lambda: api.health() == dict.fromkeys(services, "up"), 120, "every target")
@@ -157,7 +157,7 @@ def test_each_alarm_fires_when_its_cause_is_made(tmp_path):
     port, metrics = free_port(), free_port()
     flags = ("--run", "r", "--actors", 2, "--endpoint", f"tcp/127.0.0.1:{port}", *TINY)
     sick = (
-        *("--learner.curriculum.stage-1", 100_000, "--learner.checkpoint-interval-s", 2),
+        *("--learner.curriculum.stage-1", 10**9, "--learner.checkpoint-interval-s", 2),
         *("--learner.intake.target-lag", 6, "--learner.intake.max-lag", 8),  # TopspinActorsLag
         *("--learner.divergence.collapse", 0.99, "--learner.divergence.patience", 1),  # TopspinDiverged
         *("--learner.divergence.least", 0.01, "--watchdog-s", 0),

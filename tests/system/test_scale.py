@@ -18,7 +18,7 @@ def test_a_running_training_gets_more_actors_and_fewer_again(tmp_path):
     def scale(count):
         return run(tmp_path, "topspin", "scale", "--run", "r", "--actors", count)
 
-    flags = ("--run", "r", "--actors", 1, *TINY, *STAGES, "--learner.curriculum.stage-3", 100_000, "--json")
+    flags = ("--run", "r", "--actors", 1, *TINY, *STAGES, "--learner.curriculum.stage-3", 10**9, "--json")
     history = tmp_path / "history"
     refused, _, reason = scale(3)
     with running(tmp_path, "deploy.local", *flags, "--actor.history", history) as command:

@@ -11,7 +11,7 @@ from threading import Event
 import pytest
 
 from common.policy.folder import load_policy
-from tests.system.commands import STAGES, TINY, children_of, last_json, run, running
+from tests.system.commands import DATASET, STAGES, TINY, children_of, last_json, run, running
 from tests.waiting import wait_until
 from topspin.certs import main
 
@@ -38,7 +38,7 @@ def test_a_run_with_certificates_goes_through_its_stages_and_leaves_a_complete_f
         *TINY,
         *STAGES,
         "--learner.curriculum.stage-3",
-        4,
+        4 * DATASET,
     )
     folder = tmp_path / "runs" / "r"
     line = last_json(out)
@@ -47,7 +47,7 @@ def test_a_run_with_certificates_goes_through_its_stages_and_leaves_a_complete_f
     assert status == 0, err
     assert "Traceback" not in err
     assert len(out.strip().splitlines()) == 1
-    assert (line["run"], line["stage"], line["frames"]) == ("r", 3, 9 * 2 * 16 * 32)
+    assert (line["run"], line["stage"], line["frames"]) == ("r", 3, 9 * DATASET)
     assert line["policy"] == "runs/r/policy/latest"
     assert line["seconds"] > 0
     assert line["rallies"] == 40
@@ -74,7 +74,7 @@ def test_a_run_with_certificates_goes_through_its_stages_and_leaves_a_complete_f
 
 
 def test_an_actor_killed_by_hand_is_back_and_counted_within_seconds_and_an_interrupted_run_goes_on(tmp_path):
-    flags = ("--run", "r", "--actors", 2, *TINY, *STAGES, "--learner.curriculum.stage-3", 100_000)
+    flags = ("--run", "r", "--actors", 2, *TINY, *STAGES, "--learner.curriculum.stage-3", 10**9)
     with running(tmp_path, "deploy.local", *flags) as command:
         wait_until(lambda: len(rows(tmp_path)) >= 6, 90, "stage 3")
         wait_until((tmp_path / "runs" / "r" / "logs" / "spare.log").exists, 30, "a spare process")
@@ -127,11 +127,11 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
         *common,
         *network,
         "--curriculum.stage-1",
-        3,
+        1536,
         "--curriculum.stage-2",
-        2,
+        1024,
         "--curriculum.stage-3",
-        10**6,
+        10**9,
     )
     learner = (*learner, "--ppo.minibatch", 256, "--checkpoint-interval-s", 0.2)
     with (
@@ -171,7 +171,7 @@ def test_a_killed_learner_restarts_with_resume_while_its_workers_live_on(tmp_pat
 
 
 def test_a_killed_learner_and_a_hung_actor_come_back_by_themselves(tmp_path):
-    flags = ("--run", "r", "--actors", 2, *TINY, *STAGES, "--learner.curriculum.stage-3", 100_000)
+    flags = ("--run", "r", "--actors", 2, *TINY, *STAGES, "--learner.curriculum.stage-3", 10**9)
     flags += ("--watchdog-s", 6, "--learner.checkpoint-interval-s", 1)
     with running(tmp_path, "deploy.local", *flags) as command:
         wait_until(lambda: len(rows(tmp_path)) >= 60, 90, "training")

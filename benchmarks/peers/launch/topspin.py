@@ -25,7 +25,7 @@ def main() -> None:
     asked = task.order()
     options = {
         **{"run": RUN, "actors": task.CORES, "panel": "off", "metrics-port": 0, "evaluate": "false"},
-        **{"seed": asked.seed, "learner.curriculum.stage-1": 10**6},
+        **{"seed": asked.seed, "learner.curriculum.stage-1": 10**9},
         **{"learner.checkpoint-interval-s": task.SNAPSHOT_S},
     }
     flags = [f"--{name}={value}" for name, value in options.items()]

@@ -25,7 +25,7 @@ def full_view():
     gauges = {
         "stage": 3,
         "epoch": 12,
-        "epochs": 100,
+        "curriculum_frames": 120e6,
         "seconds": 300.0,
         "version": 12,
         "frames_per_s": 21_000.0,
@@ -79,21 +79,22 @@ def test_names_are_shown_as_text_and_not_read_as_markup():
 def test_the_budget_that_ends_first_decides_the_time_left():
     view = full_view()
 
-    assert share_done(view) == 0.5  # 300 s of 10 min; 12 of 100 epochs
+    assert share_done(view) == 0.5  # 300 s of 10 min; 5.2 of 120 M frames
     assert time_left_s(view) == 300.0
     assert clock(3725.0) == "1:02:05"
     assert clock(None) == "-:--"
     assert time_left_s(View("night")) is None
 
 
-def test_without_a_number_of_epochs_the_frames_decide_the_time_left():
+@pytest.mark.parametrize(("curriculum", "frames", "share"), [(0, 100, 0.3), (120, 0, 0.25), (120, 60, 0.5)])
+def test_the_curriculums_frames_or_the_runs_decide_the_time_left(curriculum, frames, share):
     view = full_view()
     status = view.statuses["learner", "0"]
-    gauges = {**status.gauges, "epochs": 0.0, "epoch": 900.0}
+    gauges = {**status.gauges, "curriculum_frames": float(curriculum)}
     view.statuses["learner", "0"] = replace(status, gauges=gauges, counters={"frames": 30.0})
-    view.minutes, view.frames = 0.0, 100
+    view.minutes, view.frames = 0.0, frames
 
-    assert share_done(view) == 0.3
+    assert share_done(view) == share
 
 
 def test_a_peer_of_many_names_does_not_fill_the_panel():

@@ -5,9 +5,11 @@ import numpy as np
 from common.comms.messages import Episodes, Rollout
 
 OBS, ACTIONS, TERMS = 37, 7, 8
+STEPS, ENVS = 16, 8
+ROLLOUT_FRAMES = STEPS * ENVS
 
 
-def make_rollout(seed=0, steps=16, envs=8, obs_size=OBS, **changes):
+def make_rollout(seed=0, steps=STEPS, envs=ENVS, obs_size=OBS, **changes):
     """Return a rollout of random numbers: its content is meaningless, its form is valid."""
     rng = np.random.default_rng(seed)
     ends = rng.uniform(size=(steps, envs))

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 from services.learner.config import CurriculumConfig
 from services.learner.curriculum import StageLengths, Trained
 
-CONFIG = CurriculumConfig(stage_1=3, stage_2=2, stage_3=10)
+CONFIG = CurriculumConfig(stage_1=300, stage_2=200, stage_3=1000)
 SHARES = CurriculumConfig(stage_shares=(0.14, 0.48, 0.38))
 
 
@@ -15,22 +15,28 @@ def stages(config, epochs, frames=0, size=100, catch=math.nan):
     lengths, trained, seen = StageLengths(config, frames), Trained(config.first_stage, 0, 0, 0), []
     for epoch in range(1, epochs + 1):
         seen.append(trained.stage)
-        trained = Trained(trained.stage, trained.epochs_in_stage + 1, epoch, epoch * size)
+        trained = Trained(trained.stage, trained.began, epoch, epoch * size)
         following = lengths.next_stage(trained, catch)
-        inside = trained.epochs_in_stage if following == trained.stage else 0
-        trained = Trained(following, inside, epoch, epoch * size)
+        began = trained.began if following == trained.stage else trained.frames
+        trained = Trained(following, began, epoch, epoch * size)
     return seen
 
 
-def in_stage(stage, epochs_in_stage=1, frames=0, epochs=0):
-    return Trained(stage, epochs_in_stage, epochs, frames)
+def in_stage(stage, began=0, frames=100, epochs=1):
+    return Trained(stage, began, epochs, frames)
 
 
-def test_each_stage_lasts_its_number_of_epochs():
+def test_each_stage_lasts_its_frames():
     assert stages(CONFIG, 8) == [1, 1, 1, 2, 2, 3, 3, 3]
 
 
-def test_a_stage_2_without_epochs_is_left_out():
+def test_a_stage_lasts_as_many_frames_with_datasets_of_another_size_and_ends_with_one():
+    assert stages(CONFIG, 9, size=50) == [1] * 6 + [2] * 3
+    assert stages(CONFIG, 6, size=160) == [1, 1, 2, 2, 3, 3]
+    assert stages(CONFIG, 3, size=5000) == [1, 2, 3]
+
+
+def test_a_stage_2_without_frames_is_left_out():
     assert stages(CONFIG.model_copy(update={"stage_2": 0}), 5) == [1, 1, 1, 3, 3]
 
 
@@ -45,7 +51,7 @@ def test_each_stage_lasts_its_share_of_the_frames_whatever_the_size_of_a_dataset
 def test_stages_before_the_first_one_give_their_share_to_the_others():
     config = SHARES.model_copy(update={"first_stage": 2})
 
-    assert StageLengths(config, 860).ends() == pytest.approx((0, 480, 860))
+    assert StageLengths(config, 860).lengths() == (0, 480, 380)
     assert set(stages(SHARES.model_copy(update={"first_stage": 3}), 10, 1000)) == {3}
 
 
@@ -85,37 +91,41 @@ def test_the_curriculum_can_be_skipped():
     config = CONFIG.model_copy(update={"first_stage": 3})
 
     assert stages(config, 5) == [3] * 5
-    assert config.epochs == 10
+    assert config.frames == 1000
 
 
 def test_the_datasets_that_a_stage_still_takes_are_counted_ahead():
     lengths, shared = StageLengths(CONFIG), StageLengths(SHARES, 1000)
 
-    assert lengths.datasets_left(in_stage(1, 1, epochs=1)) == 2
-    assert lengths.datasets_left(in_stage(3, 4, epochs=7)) == 8  # with two epochs that a gate saved
-    assert shared.datasets_left(in_stage(1, 0)) == 1  # the size of a dataset is not known yet
-    assert shared.datasets_left(in_stage(1, 1, frames=60, epochs=1)) == 2  # to 140
-    assert shared.datasets_left(in_stage(3, 1, frames=660, epochs=11)) == 6  # to 1000
+    assert lengths.datasets_left(in_stage(1)) == 2
+    assert lengths.datasets_left(in_stage(2, began=160, frames=200, epochs=2)) == 2  # to 360
+    assert lengths.datasets_left(in_stage(3, began=300, frames=700, epochs=7)) == 8  # with what a gate saved
+    assert (
+        lengths.datasets_left(in_stage(1, frames=0, epochs=0)) == 1
+    )  # the size of a dataset is not known yet
+    assert shared.datasets_left(in_stage(1, frames=60, epochs=1)) == 2  # to 140
+    assert shared.datasets_left(in_stage(3, began=620, frames=660, epochs=11)) == 6  # to 1000
 
 
 def test_the_learning_rates_bound_falls_in_the_last_stage_only():
     lengths = StageLengths(CONFIG)
 
-    def bound(stage, epochs):
-        return lengths.learning_rate_bound(in_stage(stage, epochs), 1e-3, 1e-4)
+    def bound(stage, began, frames):
+        return lengths.learning_rate_bound(in_stage(stage, began, frames), 1e-3, 1e-4)
 
-    assert bound(1, 2) == 1e-3
-    assert bound(2, 1) == 1e-3
-    assert bound(3, 0) == 1e-3
-    assert bound(3, 5) == pytest.approx(5.5e-4)
-    assert bound(3, 99) == pytest.approx(1e-4)
+    assert bound(1, 0, 200) == 1e-3
+    assert bound(2, 300, 400) == 1e-3
+    assert bound(3, 500, 500) == 1e-3
+    assert bound(3, 500, 1000) == pytest.approx(5.5e-4)
+    assert bound(3, 500, 9999) == pytest.approx(1e-4)
 
 
 def test_with_shares_the_learning_rates_bound_falls_with_the_frames_of_the_last_stage():
     lengths = StageLengths(SHARES, 1000)
 
     def bound(stage, frames):
-        return lengths.learning_rate_bound(in_stage(stage, frames=frames), 5e-4, 5e-5)
+        began = {2: 140, 3: 620}[stage]
+        return lengths.learning_rate_bound(in_stage(stage, began, frames), 5e-4, 5e-5)
 
     assert bound(2, 619) == 5e-4
     assert bound(3, 620) == pytest.approx(5e-4)

@@ -12,7 +12,7 @@ from services.learner.config import CurriculumConfig, DivergenceConfig, PPOConfi
 from services.learner.divergence import Health, divergence, watched
 from services.learner.epoch_stats import Progress
 from services.learner.training import Training
-from tests.unit.services.learner.rollouts import make_rollout
+from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
 
 LIMITS = DivergenceConfig(collapse=0.5, least=0.2, patience=5)
 EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_seconds=1.5)
@@ -25,7 +25,7 @@ def history(rates, config=LIMITS):
     return health
 
 
-def make_training(limits=LIMITS, curriculum=CurriculumConfig(stage_1=50), **ppo):
+def make_training(limits=LIMITS, curriculum=CurriculumConfig(), **ppo):
     return Training(
         PPOConfig(**{"minibatch": 64, "mini_epochs": 2, **ppo}),
         NetworkConfig(units=(16, 8)),
@@ -138,7 +138,7 @@ def test_a_rollback_restores_the_network_and_not_the_counts(tmp_path):
     assert after.learning_rate <= max(0.5 * before.learning_rate, training.ppo.learning_rate_min)
 
 
-STAGES = CurriculumConfig(stage_1=2, stage_2=2, stage_3=50)
+STAGES = CurriculumConfig(stage_1=2 * ROLLOUT_FRAMES, stage_2=2 * ROLLOUT_FRAMES, stage_3=50 * ROLLOUT_FRAMES)
 HELD = {"refit_epochs": 3, "refit_variance": 1.0, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
 
 

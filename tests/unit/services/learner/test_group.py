@@ -21,7 +21,7 @@ from tests.unit.services.learner.test_training import make_training
 ROLLOUTS = 4
 EPOCHS = 3
 # A stage change on the way: its first epochs train the critic alone
-CURRICULUM = CurriculumConfig(first_stage=1, stage_1=1, stage_2=0, stage_3=50)
+CURRICULUM = CurriculumConfig(stage_1=1, stage_2=0, stage_3=50_000)
 
 
 def trained(group: Group, ppo: PPOConfig) -> Training:

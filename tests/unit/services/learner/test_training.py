@@ -16,10 +16,11 @@ from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.epoch_stats import play_stats
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
-from tests.unit.services.learner.rollouts import make_rollout
+from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
 
 PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_epochs=1)
-CURRICULUM = CurriculumConfig(stage_1=3, stage_2=2, stage_3=50)
+DATASET = 2 * ROLLOUT_FRAMES
+CURRICULUM = CurriculumConfig(stage_1=3 * DATASET, stage_2=2 * DATASET, stage_3=50 * DATASET)
 EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_seconds=1.5)
 
 
@@ -141,7 +142,7 @@ def test_the_evaluated_weights_are_the_mean_or_the_newest():
 
 def test_the_mean_of_young_weights_covers_a_tenth_of_the_training():
     """A mean over 100 datasets from the start on was half as good as the newest weights after 350."""
-    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100}))
+    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100 * DATASET}))
     expected = training.average.mean.weight.detach().double().clone()
     for epoch in range(30):
         training.run_epoch(dataset(epoch % 3))
@@ -151,7 +152,7 @@ def test_the_mean_of_young_weights_covers_a_tenth_of_the_training():
 
 
 def test_the_mean_of_old_weights_covers_100_datasets():
-    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100}))
+    training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100 * DATASET}))
     training.progress = replace(training.progress, version=100_000)
     before = training.average.mean.weight.detach().clone()
     training.run_epoch(dataset(0))
@@ -167,7 +168,7 @@ def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
         with torch.no_grad():
             return training.network(torch.from_numpy(normalize(raw, training.obs_moments)))
 
-    curriculum = CURRICULUM.model_copy(update={"stage_2": 50})
+    curriculum = CURRICULUM.model_copy(update={"stage_2": 50 * DATASET})
 
     def moved(refit_epochs):
         ppo = PPO.model_copy(
