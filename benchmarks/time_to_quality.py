@@ -81,8 +81,8 @@ class Goal(NamedTuple):
 
 def first_passage(
     curve: Sequence[Mapping[str, Any]], asked: int, goal: Goal, is_confirmed: Callable[[], bool]
-) -> tuple[int, Mapping[str, Any] | None]:
-    """Return how many rows of a curve have been looked at, and the row of the first passage, if there is one.
+) -> Mapping[str, Any] | None:
+    """Return the row of a curve in which the goal was first reached, or None.
 
     Only the newest row is confirmed: the policy at hand is the one that it measured.
 
@@ -92,10 +92,9 @@ def first_passage(
         goal: What counts.
         is_confirmed: Returns whether the newest policy meets the goal on other balls.
     """
-    newest = curve[-1] if len(curve) > asked else None
-    if newest is None or not goal.is_met(newest):
-        return len(curve), None
-    return len(curve), newest if is_confirmed() else None
+    if len(curve) <= asked or not goal.is_met(curve[-1]):
+        return None
+    return curve[-1] if is_confirmed() else None
 
 
 def measure(name: str, seed: int) -> dict[str, Any]:
@@ -132,9 +131,10 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
                     curve.append(row)
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)
                     print(f"seed {seed}  {shown}", file=sys.stderr, flush=True)
-                asked, passage = first_passage(
+                passage = first_passage(
                     curve, asked, goal, lambda: goal.is_met(measure(name, CONFIRMING_SEED))
                 )
+                asked = len(curve)
                 time.sleep(LOOK_S)
             if passage is not None:
                 reported = measure(
