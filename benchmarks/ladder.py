@@ -79,7 +79,7 @@ RUNGS: Final = (
         },
     ),
     Rung(
-        "hits are corrected",
+        "hits are corrected, and the robot is led home after them",
         {
             "experience.hit-correction": "true",
             "learner.ppo.correction-weight": "500",
@@ -91,7 +91,7 @@ RUNGS: Final = (
         "short stages 1 and 2; episodes of several rallies, most of which end at the hit; full aerodynamics",
         {
             "learner.curriculum.stage-shares": "",
-            "experience.continue-share": "0.1",
+            "experience.continue-share": "0.4",
             "experience.end-at-hit-share": "0.8",
             "task.flight": "full",
         },
@@ -119,6 +119,11 @@ def flags_of(rung: int) -> list[str]:
     return [part for name, value in together.items() for part in (f"--{name}", value)]
 
 
+def is_measured(folder: RunFolder) -> bool:
+    """Return whether a run has trained to its end: one that was stopped leaves a summary without rates."""
+    return folder.final.is_file() and "return_rate" in json.loads(folder.final.read_text(encoding="utf-8"))
+
+
 def train(config: LadderConfig, rung: int, seed: int, stop: Event) -> None:
     """Train one rung with one seed, or go on with it; nothing if its end is measured.
 
@@ -127,7 +132,7 @@ def train(config: LadderConfig, rung: int, seed: int, stop: Event) -> None:
     """
     name = f"{config.run}-{rung}-{seed}"
     folder = RunFolder.of(name)
-    if folder.final.is_file():
+    if is_measured(folder):
         return
     new = ["--recipe", RECIPE, "--seed", str(seed), "--frames", str(config.frames), *flags_of(rung)]
     flags = ["--resume"] if folder.config.is_file() else new
@@ -143,7 +148,7 @@ def figures(config: LadderConfig, rungs: Sequence[int]) -> list[dict[str, Any]]:
     found = []
     for rung in rungs:
         names = [f"{config.run}-{rung}-{seed}" for seed in config.seeds]
-        runs = [result(find(name)) for name in names if RunFolder.of(name).final.is_file()]
+        runs = [result(find(name)) for name in names if is_measured(RunFolder.of(name))]
         if runs:
             found.append({"rung": rung, "name": RUNGS[rung].name, "runs": runs, "median": medians(runs)})
     return found

@@ -210,6 +210,11 @@ class RallyEnv:
         )
 
     @property
+    def corrects(self) -> bool:
+        """Whether actions are corrected now: before and after hits, in stage 3."""
+        return self._hit_corrector is not None and self.stage == 3
+
+    @property
     def validated(self) -> Flags:
         """Which environments play a validated rally (B,)."""
         return self._validated.copy()
@@ -278,9 +283,7 @@ class RallyEnv:
         final_obs = self._obs[ended]
         hit_corrections = NO_HIT_CORRECTIONS
         if self._hit_corrector is not None:
-            hit_corrections = self._hit_corrector.update(
-                self._rallies, self._contacts.motion, self.stage == 3
-            )
+            hit_corrections = self._hit_corrector.update(self._rallies, self._contacts.motion, self.corrects)
         finished = self._finish(over)
         same_episode = np.zeros(begins.size, np.bool_)
         if self._begins_late:

@@ -135,7 +135,8 @@ class TaskConfig(MatchConditions):
         0.5,
         ge=0,
         le=1,
-        description="share of episodes in which the robot starts where the last stroke left it",
+        description="share of episodes in which the robot starts where the last stroke left it, if that was played to "
+        "its end",
     )
     reset_spread: float = Field(
         0.1,

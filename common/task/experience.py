@@ -44,7 +44,7 @@ class ExperienceConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     continue_share: float = Field(
-        0.1, ge=0, le=1, description="share of episodes that continue with a second rally after a return"
+        0.4, ge=0, le=1, description="share of episodes that continue with a second rally after a return"
     )
     end_at_hit_share: float = Field(
         0.8,
@@ -54,7 +54,9 @@ class ExperienceConfig(BaseModel):
         "at once",
     )
     hit_correction: bool = Field(
-        True, description="in stage 3 correct the last actions before each hit (hit_correction.py)"
+        True,
+        description="in stage 3 correct the last actions before each hit (hit_correction.py), and lead the robot home "
+        "after it",
     )
     teacher: TeacherConfig = TeacherConfig()
 

@@ -282,10 +282,5 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
             raise ValueError(
                 "ppo.correction_weight 0 with experience.teacher.policy; allowed: above 0 (a teacher needs it)"
             )
-        if self.experience.teacher.policy and self.start_policy:
-            raise ValueError(
-                f"start_policy {self.start_policy} with experience.teacher.policy {self.experience.teacher.policy}; "
-                "allowed: one of them (a student starts from new weights)"
-            )
         self.curriculum.check_budget(self.frames)
         return self

@@ -5,7 +5,7 @@ from threading import Event
 
 import pytest
 
-from benchmarks.ladder import RECIPE, RUNGS, LadderConfig, flags_of, main
+from benchmarks.ladder import RECIPE, RUNGS, LadderConfig, flags_of, is_measured, main
 from benchmarks.recipe import differences, known_settings
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
@@ -51,6 +51,17 @@ def test_measured_runs_are_printed_by_rung(tmp_path, monkeypatch, capsys):
         (0, 0.3, 2),
         (3, 0.7, 1),
     ]
+
+
+def test_a_training_that_was_stopped_is_not_measured(tmp_path):
+    folder = RunFolder(tmp_path)
+    assert not is_measured(folder)
+    folder.report.mkdir()
+    folder.final.write_text(json.dumps({"frames": 1000, "ledger": {}}))
+    assert not is_measured(folder)
+    folder.final.write_text(json.dumps({"frames": 1000, "return_rate": 0.0}))
+
+    assert is_measured(folder)
 
 
 def test_a_rung_that_is_not_there_is_refused():

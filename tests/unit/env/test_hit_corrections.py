@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.env.hit_corrections import way_home
 from common.env.rally_env import EnvStep, RallyEnv
 from common.env.robot import RobotBatch
 from common.physics.chain import racket_pose
@@ -352,3 +353,26 @@ def test_more_corrected_strokes_return_the_ball():
     before, after = first_time(), corrected()
 
     assert np.isfinite(after.landings[:, 0]).mean() > np.isfinite(before.landings[:, 0]).mean() + 0.05
+
+
+def test_the_way_home_is_straight_and_ends_there():
+    home = np.linspace(-0.5, 0.5, 7, dtype=np.float32)
+    away = np.zeros((3, 7), np.float32)
+    away[0, 2], away[1, 5], away[2] = 0.01, -0.8, 0.4
+    led = way_home(home + away, home)
+
+    np.testing.assert_allclose(led[0], -away[0], atol=1e-7)  # near home: all the way
+    np.testing.assert_allclose(led[1], -away[1] * 0.02 / 0.8, atol=1e-7)
+    np.testing.assert_allclose(led[2], np.full(7, -0.02 / np.sqrt(7.0)), rtol=1e-5)
+    np.testing.assert_array_equal(way_home(home[None], home), 0.0)
+    assert way_home(np.zeros((0, 7), np.float32), home).shape == (0, 7)
+
+
+def test_a_robot_that_is_led_home_meets_its_next_ball_there():
+    """The last correction is 0 at home only: followed again and again, the mean ends there."""
+    home = np.zeros(7, np.float32)
+    mean = np.full((1, 7), 0.3, np.float32)
+    for _ in range(60):
+        mean = mean + way_home(mean, home)
+
+    np.testing.assert_allclose(mean, 0.0, atol=1e-6)

@@ -51,7 +51,7 @@ def test_training_ends_and_continues_the_shares_of_episodes_that_it_is_set_to():
 def test_the_defaults_end_four_of_five_episodes_at_the_hit_and_correct_hits():
     experience = ExperienceConfig()
 
-    assert (experience.continue_share, experience.end_at_hit_share) == (0.1, 0.8)
+    assert (experience.continue_share, experience.end_at_hit_share) == (0.4, 0.8)
     assert experience.hit_correction
     assert experience.teacher == TeacherConfig()
 

@@ -8,6 +8,7 @@ import torch
 from common.comms.messages import PolicySnapshot
 from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections
 from common.env.rally_env import Launches
+from common.env.robot import home_action
 from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError, contract_hash
 from common.policy.folder import load_policy
@@ -18,7 +19,7 @@ from common.rally.hit_correction import BACK
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
-from common.task.observation import critic_layout, policy_layout, size
+from common.task.observation import critic_layout, offsets, policy_layout, size
 from services.actor.player import Player, correct
 from tests.unit.env.teachers import write_teacher
 
@@ -232,6 +233,11 @@ def struck_block(monkeypatch, stage=3, **experience):
     return player.play("a", 9, 3), hit_corrections
 
 
+def shows_a_hit(block):
+    """Return which observations of a block show that the ball has been hit (T, B)."""
+    return block.obs[..., offsets(critic_layout(OBSERVATION))["trajectory_state"].start] > 0.0
+
+
 def test_a_blocks_corrections_are_its_hits_except_where_an_action_was_clipped(monkeypatch):
     block, hit_corrections = struck_block(monkeypatch)
     expected = np.zeros_like(block.corrections)
@@ -247,7 +253,21 @@ def test_a_blocks_corrections_are_its_hits_except_where_an_action_was_clipped(mo
     assert sum(hits.rows.size for hits in hit_corrections) > 3
     assert block.corrections.dtype == np.float32
     assert (np.abs(block.actions) >= 1.0).any()
-    np.testing.assert_array_equal(block.corrections, expected)
+    before = ~shows_a_hit(block)  # from then on the robot is led home
+    np.testing.assert_array_equal(block.corrections[before], expected[before])
+
+
+def test_after_its_hit_a_robot_is_led_home_in_small_steps_whatever_was_clipped(monkeypatch):
+    block, _ = struck_block(monkeypatch, end_at_hit_share=0.0)
+    has_hit = shows_a_hit(block)
+    led = block.corrections[has_hit]
+    home = home_action("rails")
+
+    assert has_hit.sum() > 20
+    np.testing.assert_allclose(np.linalg.norm(led, axis=1), 0.02, rtol=1e-5)
+    # the first joint's mean is 1.2 beyond home, and the others' are near it
+    assert (led[:, 0] < -0.015).all()
+    assert home[0] < 1.0
 
 
 @pytest.mark.parametrize(("stage", "changes"), [(1, {}), (2, {}), (3, {"hit_correction": False})])
@@ -260,7 +280,7 @@ def test_without_hit_correction_and_outside_stage_3_there_are_no_corrections(mon
 
 
 @pytest.mark.parametrize("version", [6, 7])
-def test_during_distillation_all_corrections_are_the_teachers(tmp_path, version):
+def test_during_distillation_all_corrections_are_the_teachers_and_lead_home_after_a_hit(tmp_path, version):
     teacher = write_teacher(tmp_path / "t").model_copy(update={"epochs": 7})
     experience = ExperienceConfig(teacher=teacher)
     player = Player(CONFIG, experience, NETWORK, Dealer(), 64, HORIZON, 1)
@@ -272,7 +292,9 @@ def test_during_distillation_all_corrections_are_the_teachers(tmp_path, version)
     assert block.episodes.caught.any()
     if version < 7:
         seen = block.obs[..., : size(policy_layout(OBSERVATION))]
-        advised = [load_policy(tmp_path / "t").act(obs).clip(-1, 1) for obs in seen]
+        advised = np.array([load_policy(tmp_path / "t").act(obs).clip(-1, 1) for obs in seen])
+        advised[shows_a_hit(block)] = player.env.home_action
+        assert shows_a_hit(block).any()
         np.testing.assert_allclose(block.actions + block.corrections, advised, atol=1e-6)
     else:
         alone = Player(CONFIG, ExperienceConfig(), NETWORK, Dealer(), 64, HORIZON, 1)

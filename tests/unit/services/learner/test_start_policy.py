@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from common.errors import ConfigError
 from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError, contract_of
 from common.policy.folder import Policy, load_policy, save_policy
@@ -126,11 +125,15 @@ def test_a_resumed_run_does_not_read_it(saved):
     )  # until its checkpoint is read
 
 
-def test_a_student_of_a_teacher_starts_from_new_weights(saved):
-    with pytest.raises(
-        ConfigError, match=r"start_policy \S+ with experience\.teacher\.policy mild; allowed: one of"
-    ):
+def test_a_student_may_start_from_a_policy_too(saved):
+    """Such as its teacher: it is led home after its hits, and plays as before otherwise."""
+    training = new_training(
         settings((*FLAGS, "--start-policy", str(saved), "--experience.teacher.policy", "mild"))
+    )
+
+    assert training.is_distilling
+    theirs = load_policy(saved).network.mean.bias
+    torch.testing.assert_close(training.network.mean.bias, theirs)
 
 
 def test_the_layout_of_these_tests_is_the_defaults():
