@@ -3,7 +3,8 @@
     python -m benchmarks.batch_sizes --sizes 8192,32768,131072 --seeds 0,1 --json
 
 Each training is one of ``benchmarks.time_to_quality``: a passage counts only if other balls confirm it. Two actors
-play as many environments as a dataset needs, so the frames are those of a hundred actors, and the minutes are not.
+(four for the largest) play as many environments as a dataset needs, and a minibatch is a quarter of it. So the frames
+are those of a hundred actors, and the minutes are not.
 Trainings are written to ``results/large_batches.json``, from which ``benchmarks.scaling`` fits its law. What is in the
 file is not trained again.
 """
@@ -28,6 +29,7 @@ from common.service.whole_file import write_whole
 
 HORIZON: Final = 32  # control steps of a rollout
 FEWEST_ACTORS: Final = 2
+MINIBATCHES: Final = 4  # of a dataset, as the law assumes
 LARGEST_ROLLOUT: Final = 131_072  # frames: 43 MB, and a message may have 64 MiB
 
 
@@ -64,7 +66,13 @@ def flags_of(size: int) -> list[str]:
         raise ReportedError(
             f"dataset of {size} frames; allowed: a multiple of {HORIZON * actors}, {actors} rollouts"
         )
-    return ["--actors", str(actors), "--actor.envs", str(envs), "--actor.horizon", str(HORIZON)]
+    flags = {
+        "--actors": actors,
+        "--actor.envs": envs,
+        "--actor.horizon": HORIZON,
+        "--learner.ppo.minibatch": size // MINIBATCHES,
+    }
+    return [text for name, value in flags.items() for text in (name, str(value))]
 
 
 def missing(config: BatchSizesConfig, points: tuple[Point, ...]) -> list[tuple[int, int]]:

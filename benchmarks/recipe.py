@@ -113,7 +113,7 @@ def result(folder: RunFolder) -> dict[str, Any]:
     return {
         "run": name,
         "seed": read_toml(folder.config).get("seed", 0),
-        "frames": int(found["frames"]),
+        "frames": int(float(found["frames"])),
         **{key: _number(found.get(key)) for key in MEASURES},
         "measured": measured,
     }

@@ -9,7 +9,7 @@ of unknown opponents with their tenth.
 
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from threading import Event
 from typing import Any, Final
@@ -32,7 +32,15 @@ BALLS_EACH: Final = 10  # of an opponent
 LATENCIES_MS: Final = (0, 10, 20, 30, 40, 50, 60)
 LAUNCHES: Final[tuple[PresetName, ...]] = ("paper", "strong", "match", "elite", "serve")
 # What the robot expects of a ball's spin, where it is told the truth
-TOLD: Final = {"paper": "mild", "strong": "strong", "match": "strong", "elite": "strong", "serve": "mild"}
+TOLD: Final[Mapping[PresetName, str]] = {
+    "paper": "mild",
+    "strong": "strong",
+    "mixed": "mixed",
+    "match": "strong",
+    "elite": "strong",
+    "serve": "mild",
+    "all": "mixed",
+}
 
 Row = dict[str, Any]
 

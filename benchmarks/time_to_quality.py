@@ -27,6 +27,8 @@ from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
+from common.policy.contract import PolicyError
+from common.policy.folder import load_policy
 from common.service.run_folder import RunFolder
 from common.service.table import whole_rows
 
@@ -80,21 +82,32 @@ class Goal(NamedTuple):
 
 
 def first_passage(
-    curve: Sequence[Mapping[str, Any]], asked: int, goal: Goal, is_confirmed: Callable[[], bool]
+    curve: Sequence[Mapping[str, Any]],
+    asked: int,
+    goal: Goal,
+    is_confirmed: Callable[[Mapping[str, Any]], bool],
 ) -> Mapping[str, Any] | None:
     """Return the row of a curve in which the goal was first reached, or None.
 
-    Only the newest row is confirmed: the policy at hand is the one that it measured.
+    Only the newest row is confirmed: the policies of others are no longer at hand.
 
     Args:
         curve: Evaluations so far.
         asked: Rows that have been looked at before.
         goal: What counts.
-        is_confirmed: Returns whether the newest policy meets the goal on other balls.
+        is_confirmed: Returns whether the policy of a row is at hand, and meets the goal on other balls.
     """
     if len(curve) <= asked or not goal.is_met(curve[-1]):
         return None
-    return curve[-1] if is_confirmed() else None
+    return curve[-1] if is_confirmed(curve[-1]) else None
+
+
+def is_at_hand(folder: RunFolder, row: Mapping[str, Any]) -> bool:
+    """Return whether the best policy of a run is the one that a row of its curve measured."""
+    try:
+        return load_policy(folder.best_policy).contract.version == int(row["version"])
+    except PolicyError:
+        return False
 
 
 def measure(name: str, seed: int) -> dict[str, Any]:
@@ -111,6 +124,8 @@ def measure(name: str, seed: int) -> dict[str, Any]:
 def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dict[str, Any]:
     """Train a run until the goal or the end of its time, and return its figures."""
     folder, goal = RunFolder.of(name), Goal(config.return_rate, config.target_error)
+    if folder.config.exists():
+        raise ReportedError(f"{folder.root} is there already, and its curve is older; choose another --run")
     command = [sys.executable, "-m", "deploy.local", "--run", name, "--seed", str(seed), "--panel", "off"]
     limit = ["--minutes", str(config.minutes), *shlex.split(config.more)]
     started = time.monotonic()
@@ -132,7 +147,8 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)
                     print(f"seed {seed}  {shown}", file=sys.stderr, flush=True)
                 passage = first_passage(
-                    curve, asked, goal, lambda: goal.is_met(measure(name, CONFIRMING_SEED))
+                    *(curve, asked, goal),
+                    lambda row: is_at_hand(folder, row) and goal.is_met(measure(name, CONFIRMING_SEED)),
                 )
                 asked = len(curve)
                 time.sleep(LOOK_S)
@@ -144,8 +160,9 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
                 process.wait(PATIENCE_S)
-    if not curve:
-        raise ReportedError(f"nothing was evaluated: see {folder.logs}")
+    if not curve or (passage is None and training.returncode and not stop.is_set()):
+        what = "was not evaluated" if not curve else f"ended with {training.returncode}"
+        raise ReportedError(f"training {name} {what}: see {folder.logs}")
     if passage is None:
         reported = measure(name, REPORTED_SEED)
     _write(curve, folder.report / "time_to_quality.csv")

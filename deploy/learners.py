@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from threading import Event
 from typing import Final
 
@@ -20,6 +20,7 @@ from common.service.process import DONE, FAILED, run_service
 
 WATCH_S: Final = 0.05
 OTHERS_END_S: Final = 15.0  # time of the others to notice that one is lost
+LONGEST_FOLDER: Final = 70  # bytes: a socket's path ends at 107, and the group's names are in it
 
 
 def environment_of(rank: int, ranks: int, file: Path, own: Mapping[str, str] = os.environ) -> dict[str, str]:
@@ -76,10 +77,18 @@ def first_failure(processes: Sequence[subprocess.Popen[bytes]]) -> tuple[int, in
     return min(failed, key=lambda one: one[1] == FAILED, default=None)
 
 
+def room_for_sockets(folder: str) -> str:
+    """Return a folder for temporary files in which a socket's path is not too long: the usual one, or /tmp.
+
+    Clusters have temporary folders with long names.
+    """
+    return folder if len(os.fsencode(folder)) <= LONGEST_FOLDER else "/tmp"
+
+
 def main(stop: Event) -> int:
     """Run the group; return the exit status of the rank that failed first, or 0."""
     ranks, logs, flags = int(sys.argv[1]), Path(sys.argv[2]), sys.argv[3:]
-    with TemporaryDirectory(prefix="topspin-") as folder:
+    with TemporaryDirectory(prefix="topspin-", dir=room_for_sockets(gettempdir())) as folder:
         failed = watch(start(ranks, logs, flags, Path(folder) / "group"), stop)
     if failed is None:
         return DONE

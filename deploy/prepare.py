@@ -60,7 +60,7 @@ class PreparedRun:
         if not last:
             return ""
         budget = Budget(self.config.learner.curriculum.frames, self.config.frames, self.config.minutes)
-        return budget.spent(int(last["frames"]), float(last["seconds"]), ENDING_S)
+        return budget.spent(int(float(last["frames"] or 0)), float(last["seconds"] or 0), ENDING_S)
 
     def specs(self) -> list[Spec]:
         """Return the processes of the run: its topology, as one function."""

@@ -110,6 +110,9 @@ def more(run: PreparedRun) -> str:
     spent = run.spent_by(last_epoch(run.folder))
     if spent.endswith("minutes"):
         return f" --minutes {2 * config.minutes:g}"
+    curriculum = config.learner.curriculum
+    longer = f" --learner.curriculum.stage-3 {2 * curriculum.stage_3}"
     if spent.endswith("frames"):
-        return f" --frames {2 * config.frames}"
-    return f" --learner.curriculum.stage-3 {2 * config.learner.curriculum.stage_3}" if spent else ""
+        is_short = curriculum.frames is not None and curriculum.frames < 2 * config.frames
+        return f" --frames {2 * config.frames}{longer if is_short else ''}"
+    return longer if spent else ""

@@ -20,7 +20,7 @@ PROG: Final = "topspin evaluate"
 class EvaluateConfig(MatchConfig):
     """Measure a policy on fixed rallies, without exploration noise, every rally to its end.
 
-    Robot, control rate, observation and flight are those of the policy's contract.
+    Robot, rubber, control rate and observation are those of the policy's contract.
     """
 
     often: ClassVar = {

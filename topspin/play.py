@@ -24,7 +24,7 @@ PROG: Final = "topspin play"
 class PlayConfig(MatchConfig, FilmConfig):
     """Measure a policy on fixed rallies, and film the first of them.
 
-    Robot, control rate, observation and flight are those of the policy's contract.
+    Robot, rubber, control rate and observation are those of the policy's contract.
     """
 
     often: ClassVar = {

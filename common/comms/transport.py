@@ -409,5 +409,5 @@ def check_size(key: str, payload: bytes, max_message_bytes: int) -> None:
     if len(payload) > max_message_bytes:
         raise TransportError(
             f"a message of {len(payload)} bytes on {key} is over the limit of {max_message_bytes}: "
-            "send smaller blocks, or raise max_message_mib at every service"
+            "send smaller blocks, or raise max_message_mib at every service, up to 64"
         )

@@ -62,7 +62,7 @@ class LinkConfig(BaseModel):
         json_schema_extra={"unit": "s"},
     )
     max_message_mib: int = Field(
-        64, ge=1, le=1024, description="largest message", json_schema_extra={"unit": "MiB"}
+        64, ge=1, le=64, description="largest message", json_schema_extra={"unit": "MiB"}
     )
     tls: str = Field(
         "",

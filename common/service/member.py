@@ -163,7 +163,7 @@ class Member:
         return True
 
     def beat(self, counters: Mapping[str, float], gauges: Mapping[str, float]) -> None:
-        """Publish a heartbeat with these numbers; gauges that are nan are left out."""
+        """Publish a heartbeat with these numbers; gauges that are not finite are left out."""
         self._metrics.set("topspin_heartbeat_time_seconds", time.time())
         self._metrics.follow("topspin_reconnects_total", self._transport.reconnect_count)
         for name, mailboxes in self._mailboxes.items():
@@ -177,7 +177,7 @@ class Member:
             time=time.time(),
             state=self.state,
             counters={name: float(value) for name, value in counters.items()},
-            gauges={name: float(value) for name, value in numbers.items() if not math.isnan(value)},
+            gauges={name: float(value) for name, value in numbers.items() if math.isfinite(value)},
         )
         self._transport.publish(self.keys.status(self.role, self.id), encode(status), Flow.STATUS)
 

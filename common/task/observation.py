@@ -159,7 +159,7 @@ class ObservationConfig(BaseModel):
     expected_spin: ExpectedSpin = Field(
         "mild",
         description="how fast balls are expected to spin. The flight hides strong spin, because lift saturates. mild: "
-        "to 100 rad/s; mixed: half of them to 100 rad/s, half to 300 rad/s; strong: to 300 rad/s; learnt: as the "
+        "to 100 rad/s; strong: to 300 rad/s, or as players hit them; mixed: half of them mild; learnt: as the "
         "opponent's earlier balls did, for play in which the balls of an environment come from one opponent after the "
         "other; not for matches with launch preset mixed",
     )

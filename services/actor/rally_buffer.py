@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from common.comms.messages import RallyBatch
 from common.env.rally_env import FinishedRallies, Launches
-from common.task.config import TaskConfig
+from common.task.config import PresetName, TaskConfig
 from common.task.launch import (
     DRAG_FACTOR,
     KIND,
@@ -23,7 +23,7 @@ from common.task.launch import (
     Purpose,
     draw_rallies,
 )
-from common.task.launch_presets import Kind
+from common.task.launch_presets import PRESETS, Kind
 from services.actor.ball_mix import BallMix
 
 # Far beyond every preset: a ball outside these limits could break the simulation.
@@ -32,20 +32,24 @@ LIMITS: Final = (
     ("velocity", VELOCITY, -60.0, 60.0),  # m/s
     ("spin", SPIN, -3000.0, 3000.0),  # rad/s
     ("drag and lift factor", slice(DRAG_FACTOR, LIFT_FACTOR + 1), 0.0, 5.0),
-    ("kind", slice(KIND, KIND + 1), 0.0, float(max(Kind))),
 )
 
 
 FAR: Final = 4096  # batches: far more than arrive out of order
 
 
-def launch_fault(batch: RallyBatch) -> str:
-    """Return why a batch's rows can't be launches, or ""."""
+def launch_fault(batch: RallyBatch, preset: PresetName) -> str:
+    """Return why a batch's rows can't be launches of a preset, or ""."""
     for name, columns, low, high in LIMITS:
         values = batch.rallies[:, columns]
         outside = values[(values < low) | (values > high)]
         if outside.size:
             return f"{name} {outside[0]:g}; allowed: {low:g} to {high:g}"
+    kinds = batch.rallies[:, KIND]
+    known = [kind for kind, share in enumerate(PRESETS[preset]) if share > 0.0]
+    strange = kinds[~np.isin(kinds, known)]
+    if strange.size:
+        return f"kind {strange[0]:g}; allowed in {preset}: {', '.join(map(str, known))}"
     return ""
 
 

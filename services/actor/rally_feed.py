@@ -108,8 +108,8 @@ class RallyFeed:
         except DecodeError as error:
             self._member.refuse("rally", error)
             return None
-        fault = launch_fault(batch)
         task = self._config.task
+        fault = launch_fault(batch, task.launch)
         if (batch.launch, batch.randomization) != (task.launch, task.randomization):
             fault = f"{batch.launch}/{batch.randomization}; allowed: {task.launch}/{task.randomization}"
         if fault:

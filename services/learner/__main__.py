@@ -2,6 +2,7 @@
 
 # ruff: noqa: PLC0415 - what a service runs on is imported after its flags are read: --help answers at once
 
+import json
 import os
 import socket
 import sys
@@ -75,7 +76,8 @@ def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
     ):
         if group.size > 1:
             endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
-            group.of_leader(config.model_copy(update={"endpoint": endpoint}).model_dump_json().encode())
+            shared = config.model_dump(mode="json") | {"endpoint": endpoint, "resume": config.resume}
+            group.of_leader(json.dumps(shared).encode())
         LearnerService(config, transport, metrics, group=group).run(stop)
     return DONE
 

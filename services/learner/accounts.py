@@ -51,11 +51,14 @@ class Accounts:
         self._changed: set[Life] = set()
         for memory in snapshots:
             life = (memory.actor, memory.incarnation)
-            self._accounts[life] = restored(memory, queued.get(life, frozenset()))
+            account = restored(memory, queued.get(life, frozenset()))
             if life == EARLIER:
-                self._accounts[life].is_alive = False
+                if life in self._accounts:  # each learner of a group has kept one
+                    account = folded(self._accounts[life], account)
+                account.is_alive = False
             else:
                 self._awaited[life] = None
+            self._accounts[life] = account
             self._newest[life[0]] = life[1]
             self._changed.add(life)
         for life in queued.keys() - self._accounts.keys():

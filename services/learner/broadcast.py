@@ -97,8 +97,10 @@ class Broadcast:
 
     def _averaged(self) -> bytes:
         """Return the newest version with the weights that are evaluated."""
+        if self._evaluated == "newest":  # not the network: within an update it is between two versions
+            return self._blob
         if not self._average:
-            self._average = self._snapshot(self._training.weights(self._evaluated))
+            self._average = self._snapshot(self._training.average)
         return self._average
 
     def _snapshot(self, network: ActorCritic) -> bytes:

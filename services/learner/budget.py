@@ -27,7 +27,9 @@ class BudgetConfig(BaseModel):
         json_schema_extra={"unit": "min"},
     )
     frames: int = Field(
-        0, ge=0, description="stop after this many trained frames, counted through restarts; 0: no limit"
+        0,
+        ge=0,
+        description="stop after this many trained frames, counted through restarts; 0: the whole curriculum",
     )
 
 

@@ -47,8 +47,9 @@ class Places:
         self._held = {number: end for number, end in self._held.items() if end > now}
         if found := _NUMBER.search(name):
             return name, int(found[0])
+        taken = {int(found[0]) for other in present if (found := _NUMBER.search(other))}
         number = 0
-        while str(number) in present or number in self._held:
+        while number in taken or number in self._held:
             number += 1
         if len(self._held) >= MOST_HELD:
             number = next(iter(self._held))

@@ -23,8 +23,7 @@ from services.learner.ledger import AccountSnapshot
 from services.learner.members import Members
 from services.learner.training import Training
 
-ROLLOUT_MAILBOX: Final = 256  # more than all rollouts in flight: a full mailbox refuses them
-REPORT_MAILBOX: Final = 256  # more than all actors of a run send at once
+MAILBOX: Final = 256  # messages that it holds at least; a full one refuses them
 SERVED_AT_ONCE: Final = 64  # messages of a kind read between two gradient steps
 
 
@@ -59,8 +58,10 @@ class Reception:
         self._metrics, self._history, self.intake, self._obs_size = metrics, history, intake, obs_size
         self._limit_bytes = config.max_message_mib * 2**20
         keys = member.keys
-        self._rollouts = transport.serve(keys.every_rollout(group.rank), capacity=ROLLOUT_MAILBOX)
-        self._reports = transport.serve(keys.every_report(group.rank), capacity=REPORT_MAILBOX)
+        # After a checkpoint every actor may have sent all that it may send
+        capacity = max(MAILBOX, config.actors * (config.intake.window + 1))
+        self._rollouts = transport.serve(keys.every_rollout(group.rank), capacity=capacity)
+        self._reports = transport.serve(keys.every_report(group.rank), capacity=capacity)
         member.watch("rollout", self._rollouts)
         member.watch("report", self._reports)
         self.members = Members(config, transport, member, intake, group, clock)

@@ -107,12 +107,11 @@ class RunLog:
             table.set_aside(self._path, found.refused)
             table.rewrite(self._path, found.columns, kept)
         self._evaluations_read = len(whole_rows(self._evaluations))
-        files = sorted(self._tensorboard.glob("events.*"), reverse=True)
+        files = list(self._tensorboard.glob("events.*"))
         if files:  # imported late, as in `TensorBoardWriter`
             from services.learner.event_files import cut_after  # noqa: PLC0415
-        for file in files:
-            if not cut_after(file, frames):
-                break
+        for file in files:  # all of them: after a clock step their names are not in the order of their steps
+            cut_after(file, frames)
 
     def close(self) -> None:
         """Write what the writers keep back."""
@@ -125,7 +124,9 @@ class RunLog:
             try:
                 writer.write(frames, found)
             except OSError as error:
-                log.error("can't write the curves folder=%s reason=%s", self._tensorboard, error.strerror)
+                log.error(
+                    "can't write the curves folder=%s reason=%s", self._tensorboard, error.strerror or error
+                )
 
     def _new_evaluations(self, frames: int) -> list[dict[str, str]]:
         """Return the evaluations since the last call, of policies with up to ``frames``.

@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from common.errors import ConfigError
+from common.errors import ConfigError, ReportedError
 from common.task.reward import TERMS
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ def own_writers(names: Sequence[str], run: str, folder: Path) -> list[ScalarWrit
 
     Raises:
         ConfigError: There is none of this name.
+        ReportedError: A writer can't begin.
     """
     known = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
     for name in names:
@@ -124,4 +125,10 @@ def own_writers(names: Sequence[str], run: str, folder: Path) -> list[ScalarWrit
             raise ConfigError(
                 f"writers {name!r}: no entry point of this name in the group {ENTRY_POINTS}; allowed: {installed}"
             )
-    return [known[name].load()(run, folder) for name in names]
+    found = []
+    for name in names:
+        try:
+            found.append(known[name].load()(run, folder))
+        except OSError as error:
+            raise ReportedError(f"writer {name} can't begin: {error}") from None
+    return found

@@ -47,7 +47,7 @@ class SharedMemoryLinks:
     """
 
     def __init__(self, rank: int, size: int, file: Path, timeout_s: float) -> None:
-        self._rank, self._size = rank, size
+        self._rank, self._size, self._timeout_s = rank, size, timeout_s
         self._sockets = _meet(rank, size, file, timeout_s)
         memory = _share(rank, self._sockets, 2 * size * MAILBOX)
         mailboxes = np.frombuffer(memory, np.uint8).reshape(2, size, MAILBOX)
@@ -105,8 +105,11 @@ class SharedMemoryLinks:
         boxes[self._rank, : len(own)] = own
         for link in self._sockets.values():
             link.sendall(b".")
+        deadline = time.monotonic() + self._timeout_s
         for other, link in self._sockets.items():
             while on_tick is not None and not _has_news(link):
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"rank {other} has been silent for {self._timeout_s:g} s")
                 on_tick()
             if not link.recv(1):
                 raise ConnectionError(f"rank {other} has ended")

@@ -13,6 +13,7 @@ from types import ModuleType
 from common.errors import ConfigError, ReportedError
 
 PROJECT = "topspin"
+FRAMES = "frames"
 
 
 class WandbWriter:
@@ -33,12 +34,14 @@ class WandbWriter:
                 dir=str(folder),
                 resume="allow",
             )
+            # Evaluations arrive behind their frames, and wandb leaves out steps that go back: so frames are a value
+            self._run.define_metric("*", step_metric=FRAMES)
         self._error: type[Exception] = wandb.errors.Error
 
     def write(self, frames: int, scalars: Mapping[str, float]) -> None:
         """Write scalars at a number of trained frames."""
         with _as_os_errors(self._error):
-            self._run.log(dict(scalars), step=frames)
+            self._run.log({**scalars, FRAMES: frames})
 
     def close(self) -> None:
         """Write what is not written yet."""

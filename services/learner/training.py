@@ -204,7 +204,8 @@ class Training:
         # The gate is left out here: when it opens, rollouts of this stage are in flight, and are trained on first.
         trained = Trained(before.stage, before.began, before.epoch + 1, before.frames + batch.frames)
         stage, due = (self.stages.next_stage(trained, rate) for rate in (float("nan"), running))
-        closing = before.closing - 1 if before.closing else self.notice if due != stage else 0
+        opens = min(self.notice, self.stages.datasets_left(trained)) if due != stage else 0
+        closing = before.closing - 1 if before.closing else opens
         if before.closing == 1:
             stage = self.stages.after(before.stage)
         changed = stage != before.stage

@@ -20,6 +20,7 @@ def test_the_flags_make_datasets_of_the_size_in_messages_of_64_mib_at_most(size)
     rollout = config.actor.envs * config.actor.horizon
 
     assert config.actors * rollout == size
+    assert 4 * config.learner.ppo.minibatch == size
     assert 400 * rollout < 64 * 2**20  # a frame has fewer bytes
 
 
@@ -54,7 +55,10 @@ def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, mon
     main(config, Event())
 
     assert [name for name, _, _ in asked] == ["b-8192-0", "b-32768-0", "b-8192-1", "b-8192-1", "b-32768-1"]
-    assert asked[0][2] == "--actors 2 --actor.envs 128 --actor.horizon 32 --frames 20000000"
+    assert (
+        asked[0][2]
+        == "--actors 2 --actor.envs 128 --actor.horizon 32 --learner.ppo.minibatch 2048 --frames 20000000"
+    )
     assert first == (
         Point(dataset=8192, frames=9_000_000, seed=0),
         Point(dataset=32_768, frames=None, seed=0),  # it trained to its end

@@ -1,8 +1,15 @@
 """When the goal is reached, and what several seeds come to."""
 
+import json
+import shutil
+from threading import Event
+
 import pytest
 
-from benchmarks.time_to_quality import Goal, first_passage, spread
+from benchmarks.time_to_quality import Goal, TimeToQualityConfig, first_passage, is_at_hand, spread, train
+from common.errors import ReportedError
+from common.policy.box import BOX
+from common.service.run_folder import RunFolder
 
 GOAL = Goal(0.81, 0.31)
 MET = {"return_rate": "0.82", "target_error_mean": "0.30"}
@@ -31,11 +38,11 @@ def test_the_goal_is_reached_if_both_figures_are(returned, error, reached):
     ],
 )
 def test_a_passage_counts_only_if_other_balls_confirm_it(curve, asked, confirmed, passage):
-    assert first_passage(curve, asked, GOAL, lambda: confirmed) == passage
+    assert first_passage(curve, asked, GOAL, lambda _: confirmed) == passage
 
 
 def test_a_policy_that_misses_the_goal_plays_no_other_balls():
-    def fails():
+    def fails(_):
         raise AssertionError("it was measured")
 
     first_passage([MISSED], 0, GOAL, fails)
@@ -50,3 +57,23 @@ def test_runs_that_missed_the_goal_count_as_slower_than_all_others():
 
     assert spread(runs, "minutes") == {"median": 8.0, "lowest": 6.5, "highest": None}
     assert spread(runs[1:2], "minutes") == {"median": None, "lowest": None, "highest": None}
+
+
+def test_a_run_that_is_there_is_not_taken_for_a_new_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder.of("old")
+    folder.create()
+    folder.config.write_text("")
+
+    with pytest.raises(ReportedError, match="is there already, and its curve is older; choose another --run"):
+        train(TimeToQualityConfig(), "old", 0, Event())
+
+
+def test_only_the_policy_that_a_row_measured_confirms_it(tmp_path):
+    folder = RunFolder(tmp_path)
+    assert not is_at_hand(folder, {"version": "0"})
+    shutil.copytree(BOX / "mild", folder.best_policy)
+    version = json.loads((folder.best_policy / "contract.json").read_text())["version"]
+
+    assert is_at_hand(folder, {"version": str(version)})
+    assert not is_at_hand(folder, {"version": str(version + 1)})

@@ -5,7 +5,7 @@ from threading import Event
 
 import pytest
 
-from deploy.learners import environment_of, first_failure, watch
+from deploy.learners import environment_of, first_failure, room_for_sockets, watch
 
 WAITS = "import time; time.sleep(60)"
 
@@ -58,3 +58,11 @@ def test_ranks_find_each_other_on_this_machine_only():
         "WORLD_SIZE": "3",
         "GROUP_FILE": "/tmp/group",
     }
+
+
+def test_sockets_have_room_under_a_long_name_of_temporary_files():
+    long = f"/scratch/{'x' * 90}"
+    deepest = Path(room_for_sockets(long)) / "topspin-12345678" / "group-1000000"
+
+    assert len(str(deepest)) < 108
+    assert room_for_sockets("/var/tmp") == "/var/tmp"

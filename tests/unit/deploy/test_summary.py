@@ -60,6 +60,14 @@ def test_a_run_that_was_not_measured_or_returned_nothing_has_no_invented_figures
         ({"minutes": 10.0}, 5000, 599.5, " --minutes 20"),
         ({"frames": 5000}, 5000, 10.0, " --frames 10000"),
         ({"frames": 5000}, 4000, 10.0, ""),
+        ({}, 120_000_000, 10.0, " --learner.curriculum.stage-3 234000000"),
+        # both limits are spent: one alone would leave nothing to train
+        (
+            {"frames": 120_000_000},
+            120_000_000,
+            10.0,
+            " --frames 240000000 --learner.curriculum.stage-3 234000000",
+        ),
     ],
 )
 def test_going_on_gives_a_run_whose_budget_is_spent_more_of_it(tmp_path, settings, frames, seconds, more):

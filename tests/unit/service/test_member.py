@@ -1,5 +1,6 @@
 """A service as a member of its run."""
 
+import math
 import re
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import pytest
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
 from common.comms.memory_transport import MemoryBroker
-from common.comms.messages import Command, Control, ControlReply
+from common.comms.messages import Command, Control, ControlReply, Status
 from common.comms.transport import Flow
 from common.service.member import REFUSED_KINDS, Member
 from common.service.metrics import Metrics
@@ -29,6 +30,18 @@ def test_a_service_drains_on_command_only_where_the_hub_knows_who_commands(tls):
     assert reply.reason == (
         "" if tls else "commands need TLS (--tls): on an open hub anybody could send them"
     )
+
+
+def test_a_heartbeat_leaves_out_what_no_reader_takes():
+    broker, config = MemoryBroker(), ServiceConfig(run="r", id="0")
+    hub, panel = broker.open(hub=True), broker.open()
+    heard = panel.subscribe(Keys("r").status("learner", "0"), capacity=4)
+    Member("learner", config, hub, Metrics("learner", "0"), 1).beat(
+        {}, {"kl": math.inf, "lag": math.nan, "a": 1.0}
+    )
+    (sample,) = heard.poll()
+
+    assert dict(decode(sample.payload, Status).gauges) == {"a": 1.0}
 
 
 @pytest.mark.parametrize("role", REFUSED_KINDS)

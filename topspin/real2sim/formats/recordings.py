@@ -25,13 +25,20 @@ def load(path: Path, *, turn: bool = False) -> Recordings:
         raise RecordingError(f"{path}: no such file")
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: got an empty file; allowed: recordings")
+    try:
+        return require_some(_read(path, turn))
+    except OSError as error:
+        raise RecordingError(f"{path}: {error.strerror or error}") from None
+
+
+def _read(path: Path, turn: bool) -> Recordings:
     suffix = path.suffix.lower()
     if suffix == ".json":
-        return require_some(read_json(path, turn))
+        return read_json(path, turn)
     if suffix in (".hdf5", ".h5"):
-        return require_some(read_hdf5(path))
+        return read_hdf5(path)
     if suffix in (".csv", ".txt"):
-        return require_some(read_csv(path, turn))
+        return read_csv(path, turn)
     raise RecordingError(f"{path}: got a {suffix or 'nameless'} file; allowed: {', '.join(SUFFIXES)}")
 
 

@@ -115,9 +115,28 @@ def test_generators_launches_pass_and_impossible_ones_do_not(preset):
     wild = block.launches.copy()
     wild[17, 4] = 1e9
 
-    assert launch_fault(batch) == ""
-    assert launch_fault(make_batch(count=200, rallies=wild, seeds=block.seeds)) == (
+    assert launch_fault(batch, preset) == ""
+    assert launch_fault(make_batch(count=200, rallies=wild, seeds=block.seeds), preset) == (
         "velocity 1e+09; allowed: -60 to 60"
+    )
+
+
+@pytest.mark.parametrize(
+    ("preset", "kind", "allowed"),
+    [
+        ("paper", 2.0, "0"),
+        ("mixed", 4.0, "0, 1"),
+        ("all", 5.0, "0, 1, 2, 3, 4"),
+        ("all", 0.5, "0, 1, 2, 3, 4"),
+    ],
+)
+def test_kinds_that_the_preset_does_not_have_are_refused(preset, kind, allowed):
+    """No ring would be asked for them, and an actor that has no others would find nothing to play."""
+    block = draw_rallies(20, TaskConfig(launch=preset), seed=1)
+    block.launches[3, 11] = kind
+
+    assert launch_fault(make_batch(count=20, rallies=block.launches, seeds=block.seeds), preset) == (
+        f"kind {kind:g}; allowed in {preset}: {allowed}"
     )
 
 

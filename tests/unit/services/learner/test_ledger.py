@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.comms.messages import ActorReport, Refusal, VerdictKind
+from services.learner.accounts import EARLIER, Accounts
 from services.learner.ledger import FATES, Account, AccountSnapshot, Fate, Ledger, Outcome, restored
 
 OUTCOMES = (Fate.TRAINED, Fate.TRAINED, Fate.TRAINED, Fate.DROPPED, VerdictKind.TOO_OLD)
@@ -179,3 +180,18 @@ def test_ranges_equal_a_plain_list_of_numbers(operations, generation):
         assert account.ranges == sum(
             outcomes[n] is not None and (n == 0 or outcomes[n - 1] is not outcomes[n]) for n in range(32)
         )
+
+
+def test_the_closed_lives_of_every_learner_of_a_group_are_kept():
+    """Each of them has an account of its own for all closed lives; the next leader gets them all."""
+    memories = []
+    for trained in (10, 5):
+        account = Account(*EARLIER)
+        for sequence in range(trained):
+            account.settle(sequence, Fate.QUEUED)
+            account.settle(sequence, Fate.TRAINED)
+        memories.append(account.snapshot())
+
+    total = Accounts(memories, {}, ()).total()
+
+    assert (total.trained, total.published, total.balance) == (15, 15, 0)

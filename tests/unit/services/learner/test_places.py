@@ -32,6 +32,11 @@ def test_a_number_that_nobody_took_is_free_again():
     assert places.give("", set(), HELD_S + 1.0) == ("0", 0)
 
 
+def test_a_number_that_a_named_actor_has_is_not_given():
+    places = Places()
+    assert places.give("", {"gpu-0", "desk", "rack-2"}, 0.0) == ("1", 1)
+
+
 def test_a_name_of_a_certificate_has_its_own_number():
     places = Places()
     assert places.give("7", {"0"}, 0.0) == ("7", 7)

@@ -2,11 +2,13 @@
 
 import logging
 import math
+from importlib.metadata import EntryPoint
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from common.errors import ConfigError
+import services.learner.scalars as scalars_module
+from common.errors import ConfigError, ReportedError
 from common.service.table import Table, whole_rows
 from services.evaluator.service import CURVE
 from services.learner.epoch_stats import EpochStats, Progress, play_stats
@@ -170,3 +172,47 @@ def test_an_installed_package_offers_a_writer_of_its_own(tmp_path, monkeypatch):
         ConfigError, match=r"writers 'comet': no entry point .* topspin.writers; allowed: .*lines"
     ):
         own_writers(["comet"], "night", tmp_path)
+
+
+class Down:
+    """A writer whose program is not reachable."""
+
+    def __init__(self, run, folder):
+        if folder is not None:
+            raise OSError("tracker: no answer")
+
+    def write(self, frames, scalars):
+        raise OSError("tracker: no answer")
+
+    def close(self):
+        pass
+
+
+def test_a_writers_error_says_what_it_was_and_training_goes_on(tmp_path, caplog):
+    log = run_log(tmp_path, Down("night", None))
+    log.append({"epoch": 1, "frames": 100, "kl": 0.5})
+    log.close()
+
+    assert "reason=tracker: no answer" in caplog.text
+    assert in_table(tmp_path) == [(100, 0.5)]
+
+
+def test_a_writer_that_cannot_begin_ends_the_run_with_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        scalars_module, "entry_points", lambda group: [EntryPoint("down", f"{__name__}:Down", group)]
+    )
+
+    with pytest.raises(ReportedError, match=r"^writer down can't begin: tracker: no answer$"):
+        own_writers(["down"], "night", tmp_path)
+
+
+def test_a_clock_that_was_set_back_between_two_lives_hides_no_file_from_the_cut(tmp_path):
+    logged(tmp_path, range(1, 4))
+    (first,) = (tmp_path / "tb").iterdir()
+    first.rename(first.with_name("events.out.tfevents.9999999999.host"))  # the newest name, the oldest steps
+    logged(tmp_path, range(4, 9))
+    run_log(tmp_path).truncate(5, 500)
+
+    assert (
+        sorted(in_tensorboard(tmp_path)) == in_table(tmp_path) == [(100 * n, 0.01 * n) for n in range(1, 6)]
+    )

@@ -95,13 +95,14 @@ def test_a_rank_that_ends_is_noticed_at_once(tmp_path):
     assert said.startswith("rank 0 of 2 learners lost another one: ")
 
 
-def test_a_rank_that_is_silent_is_lost_after_a_while(tmp_path):
+@pytest.mark.parametrize("on_tick", [None, lambda: time.sleep(0.001)], ids=["idle", "busy"])
+def test_a_rank_that_is_silent_is_lost_after_a_while(tmp_path, on_tick):
     def act(rank, links):
         if rank == 1:
             time.sleep(0.5)
             return
         with pytest.raises(TimeoutError):
-            links.exchanged(b"")
+            links.exchanged(b"", on_tick)
 
     together(2, tmp_path, act, timeout_s=0.1)
 

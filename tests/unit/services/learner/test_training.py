@@ -161,6 +161,18 @@ def test_the_mean_of_old_weights_covers_100_datasets():
     torch.testing.assert_close(moved, (training.network.mean.weight - before) / 100.0, rtol=1e-3, atol=1e-9)
 
 
+def test_a_gate_that_opens_near_the_stages_end_promises_no_more_datasets_than_it_has():
+    """Actors collect what is promised, and a dataset of the stage before would be lost."""
+    curriculum = CURRICULUM.model_copy(update={"catch_gate": 1e-6})
+    training = Training(PPO, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0, notice=4)
+    promised = []
+    for epoch in range(3):
+        training.run_epoch(dataset(epoch))
+        promised.append((training.progress.stage, training.datasets_left))
+
+    assert promised == [(1, 2), (1, 1), (2, 2)]
+
+
 def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
     raw = 0.3 * make_rollout(77).obs.reshape(-1, 37)
 

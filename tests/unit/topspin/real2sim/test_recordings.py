@@ -1,6 +1,7 @@
 """Reading recordings: round trips through every format, what is dropped and why, and every error text."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -499,3 +500,20 @@ def test_a_folder_is_read_by_name_and_must_hold_something(tmp_path):
         write_csv(tmp_path / f"{name}.csv", "t;x;y;z", rows_of(TRACK))
 
     assert [found.tracks[0].id for found in load_folder(tmp_path, "*.csv")] == ["a", "b"]
+
+
+def test_a_file_that_may_not_be_read_is_one_bad_file_of_a_folder(tmp_path, monkeypatch):
+    for name in ("a.csv", "b.csv"):
+        write_csv(tmp_path / name, "t;x;y;z", rows_of(TRACK))
+    read_bytes = Path.read_bytes
+
+    def refuse(self):
+        if self.name == "a.csv":
+            raise PermissionError(13, "Permission denied", str(self))
+        return read_bytes(self)
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)  # a test that runs as root may read everything
+    skipped: dict[str, str] = {}
+
+    assert len(load_folder(tmp_path, skipped=skipped)) == 1
+    assert skipped == {"a.csv": f"{tmp_path / 'a.csv'}: Permission denied"}
