@@ -76,10 +76,19 @@ def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
     ):
         if group.size > 1:
             endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
-            shared = config.model_dump(mode="json") | {"endpoint": endpoint, "resume": config.resume}
-            group.of_leader(json.dumps(shared).encode())
+            group.of_leader(settings_for_others(config, endpoint))
         LearnerService(config, transport, metrics, group=group).run(stop)
     return DONE
+
+
+def settings_for_others(config: LearnerConfig, endpoint: str) -> bytes:
+    """Return the settings of the learners that train with the leading one.
+
+    A resumed run is told, although no settings file says so: what it began with may be gone.
+    """
+    return json.dumps(
+        config.model_dump(mode="json") | {"endpoint": endpoint, "resume": config.resume}
+    ).encode()
 
 
 def follow(stop: Event) -> int:

@@ -11,7 +11,8 @@ from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import ExperienceConfig
 from common.task.observation import critic_layout, policy_layout, size
-from services.learner.__main__ import settings
+from services.learner.__main__ import settings, settings_for_others
+from services.learner.config import LearnerConfig
 from services.learner.training import new_training
 from tests.unit.services.learner.rollouts import make_rollout
 
@@ -123,6 +124,14 @@ def test_a_resumed_run_does_not_read_it(saved):
     torch.testing.assert_close(
         training.network.mean.bias, new.network.mean.bias
     )  # until its checkpoint is read
+
+
+def test_no_learner_of_a_resumed_group_reads_it():
+    leader = settings((*FLAGS, "--start-policy", "gone")).model_copy(update={"resume": True})
+    config = LearnerConfig.model_validate_json(settings_for_others(leader, "tcp/hall:7447"))
+
+    assert (config.resume, config.endpoint) == (True, "tcp/hall:7447")
+    assert new_training(config).has_start_policy
 
 
 def test_a_student_may_start_from_a_policy_too(saved):
