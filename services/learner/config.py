@@ -141,11 +141,15 @@ class CurriculumConfig(BaseModel):
             raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
 
     @property
+    def lengths(self) -> tuple[float, ...]:
+        """Return the length of each stage, in frames or as a share; 0 for stages before the first one."""
+        lengths = self.stage_shares or (self.stage_1, self.stage_2, self.stage_3)
+        return tuple(0 if stage < self.first_stage else length for stage, length in enumerate(lengths, 1))
+
+    @property
     def frames(self) -> int | None:
         """Return the frames of all stages from the first one; None: the stages are shares of the run's frames."""
-        if self.stage_shares:
-            return None
-        return sum((self.stage_1, self.stage_2, self.stage_3)[self.first_stage - 1 :])
+        return None if self.stage_shares else int(sum(self.lengths))
 
 
 class DivergenceConfig(BaseModel):

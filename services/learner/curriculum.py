@@ -35,12 +35,8 @@ class StageLengths:
 
     def lengths(self) -> tuple[int, ...]:
         """Return the frames of each stage; shares of stages before the first one go to the others."""
-        config = self.config
-        wanted: tuple[float, ...] = config.stage_shares or (config.stage_1, config.stage_2, config.stage_3)
-        wanted = tuple(
-            0.0 if stage < config.first_stage else length for stage, length in enumerate(wanted, 1)
-        )
-        scale = self.frames / sum(wanted) if config.stage_shares else 1.0
+        wanted = self.config.lengths
+        scale = self.frames / sum(wanted) if self.config.stage_shares else 1.0
         # rounded: 0.14 of 10,000 is 1,400.0000000000002, which would take one more dataset
         return tuple(round(scale * length) for length in wanted)
 
