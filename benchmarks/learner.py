@@ -4,7 +4,8 @@
 
 It trains epochs on rollouts that were played before. The limit are the matrix products of such an epoch alone: of the
 network's layers, forward for reading the data, forward and backward for each gradient step, in the same precision and
-batch size on the same thread. Both alternate.
+batch size on the same thread, or on the same device. Both alternate. ``--device cuda`` also measures for which share of
+the time the device computes.
 """
 
 import json
@@ -25,15 +26,17 @@ from common.comms.codec import encode
 from common.policy.actor_critic import ActorCritic
 from common.policy.network_pass import DTYPES
 from services.learner.admission import open_rollout
-from services.learner.config import PPOConfig
-from services.learner.ppo import precision_of
+from services.learner.compute import Compute
+from services.learner.config import Device, PPOConfig
 
 ROLLOUTS = 4  # played before the measurement, and repeated
 
 
-def bare_products(network: ActorCritic, frames: int, ppo: PPOConfig) -> tuple[Callable[[], None], float]:
+def bare_products(
+    network: ActorCritic, frames: int, ppo: PPOConfig, compute: Compute
+) -> tuple[Callable[[], None], float]:
     """Return a function that computes an epoch's products, and how many floating-point operations they are."""
-    dtype, rows = DTYPES[precision_of(ppo)], min(ppo.minibatch, frames)
+    dtype, rows = DTYPES[compute.precision], min(ppo.minibatch, frames)
     batches = frames // rows
     layers, operations = [], 0.0
     for name, linear in network.named_modules():
@@ -43,13 +46,14 @@ def bare_products(network: ActorCritic, frames: int, ppo: PPOConfig) -> tuple[Ca
         is_first = name == "trunk.layers.0"
         hidden = 0 if is_first else inputs - (network.obs_size if name.startswith("trunk.layers") else 0)
         x, w, g = (
-            torch.randn(shape).to(dtype) for shape in ((rows, inputs), (outputs, inputs), (rows, outputs))
+            torch.randn(shape).to(compute.device, dtype)
+            for shape in ((rows, inputs), (outputs, inputs), (rows, outputs))
         )
         layers.append((x, w, g, w[:, :hidden].contiguous()))
         steps = batches * ppo.mini_epochs
         operations += 2.0 * rows * outputs * (inputs * (batches + 2 * steps) + hidden * steps)
 
-    def compute() -> None:
+    def multiply() -> None:
         for _ in range(batches):
             for x, w, _, _ in layers:
                 torch.mm(x, w.t())
@@ -59,20 +63,37 @@ def bare_products(network: ActorCritic, frames: int, ppo: PPOConfig) -> tuple[Ca
                 torch.mm(g.t(), x)
                 if back.shape[1]:
                     torch.mm(g, back)
+        if compute.device.type == "cuda":
+            torch.cuda.synchronize()
 
-    return compute, operations
+    return multiply, operations
 
 
-def measure(envs: int, seconds: float, seed: int, ppo: PPOConfig) -> dict[str, float | str]:
+def busy_share(act: Callable[[], object]) -> float:
+    """Return the share of the time of ``act`` in which the GPU computes or copies."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        seconds = seconds_of(act)
+    busy_us = float(sum(event.self_device_time_total for event in profile.key_averages()))
+    return busy_us / 1e6 / seconds
+
+
+def measure(
+    envs: int, seconds: float, seed: int, ppo: PPOConfig, device: Device = "cpu"
+) -> dict[str, float | str]:
     """Train for ``seconds`` and return the figures."""
-    training = make_training(ppo, seed)
+    training = make_training(ppo, seed, device=device)
+    compute = training.compute
     player = make_player(training, envs, seed)
     rollouts = [player.play("benchmark", 1, sequence) for sequence in range(ROLLOUTS)]
     payload = encode(rollouts[0])
     following = cycle(rollouts)
     frames = rollouts[0].rewards.size
-    products, operations = bare_products(training.network, frames, ppo)
-    measured = paired(lambda: training.run_epoch([next(following)]), products, seconds)
+    products, operations = bare_products(training.network, frames, ppo, compute)
+
+    def epoch() -> None:
+        training.run_epoch([next(following)])  # it ends with the network's new parameters in the CPU's memory
+
+    measured = paired(epoch, products, seconds)
     read_s, decode_s = (
         float(np.median([seconds_of(act) for _ in range(5)]))
         for act in (
@@ -88,11 +109,13 @@ def measure(envs: int, seconds: float, seed: int, ppo: PPOConfig) -> dict[str, f
         "epoch_ms": round(1e3 * measured.seconds, 1),
         "read_ms": round(1e3 * read_s, 1),
         "decode_ms": round(1e3 * decode_s, 2),
-        "precision": precision_of(ppo),
+        "device": str(compute.device),
+        "precision": compute.precision,
         "threads": torch.get_num_threads(),
         "frames": frames,
         "minibatch": ppo.minibatch,
         "mini_epochs": ppo.mini_epochs,
+        **({"busy_share": round(busy_share(epoch), 4)} if compute.device.type == "cuda" else {}),
     }
 
 
@@ -100,12 +123,13 @@ class LearnerBenchmarkConfig(TimedConfig):
     """Measure how fast the learner trains from memory, and compare it with its matrix products alone."""
 
     envs: int = Field(256, ge=1, le=65536, description="environments; a dataset has 32 frames of each")
+    device: Device = Field("cpu", description="where updates compute; auto: on a GPU where there is one")
     ppo: PPOConfig = PPOConfig()
 
 
 def main(config: LearnerBenchmarkConfig, _stop: Event) -> int:
     """Measure and print."""
-    result = measure(config.envs, config.seconds, config.seed, config.ppo)
+    result = measure(config.envs, config.seconds, config.seed, config.ppo, config.device)
     if config.json_line:
         print(json.dumps(result))
     else:

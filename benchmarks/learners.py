@@ -34,9 +34,9 @@ from benchmarks.settings import TimedConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import Rollout
 from deploy.prepare import free_port
+from services.learner.compute import compute_of
 from services.learner.config import PPOConfig
 from services.learner.group import join
-from services.learner.ppo import precision_of
 
 EPOCHS_COMPARED: Final = 3
 WIDE: Final = 0.99  # clip of the second comparison
@@ -154,7 +154,7 @@ def measure(
         "epochs_compared": EPOCHS_COMPARED,
         "frames": 32 * envs * ranks,
         "minibatch": ppo.minibatch,
-        "precision": precision_of(ppo),
+        "precision": compute_of(ppo).precision,
     }
 
 

@@ -12,7 +12,9 @@ from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
 from services.actor.player import Player
-from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.compute import compute_of
+from services.learner.config import CurriculumConfig, Device, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.group import ALONE, Group
 from services.learner.training import Training
 
@@ -22,12 +24,16 @@ HORIZON = 32  # control steps of a rollout
 STAGE = 3  # the stage that a run spends most of its frames in
 
 
-def make_training(ppo: PPOConfig, seed: int, group: Group = ALONE) -> Training:
+def make_training(ppo: PPOConfig, seed: int, group: Group = ALONE, device: Device = "cpu") -> Training:
     """Return a new training of the default task and network."""
     task = TaskConfig()
     curriculum = CurriculumConfig(first_stage=STAGE)
     home = home_action(task.robot)
-    training = Training(ppo, NetworkConfig(), curriculum, home, seed, observation=task.observation)
+    training = Training(
+        *(ppo, NetworkConfig(), StageLengths(curriculum), home, seed),
+        observation=task.observation,
+        compute=compute_of(ppo, device),
+    )
     training.group = group
     return training
 

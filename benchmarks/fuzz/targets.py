@@ -27,6 +27,7 @@ from services.learner import checkpoint
 from services.learner.admission import open_rollout
 from services.learner.checkpoint import CheckpointError, Extras
 from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.training import Training
 from topspin.real2sim.formats.recordings import load
 from topspin.real2sim.formats.tracks import RecordingError
@@ -91,7 +92,7 @@ def _admission() -> Target:
 
 def _training() -> Training:
     home, observation = np.zeros(7, np.float32), TaskConfig().observation
-    return Training(PPOConfig(), SMALL, CurriculumConfig(), home, 0, observation=observation)
+    return Training(PPOConfig(), SMALL, StageLengths(CurriculumConfig()), home, 0, observation=observation)
 
 
 def _policy() -> tuple[Target, Target]:

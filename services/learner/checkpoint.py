@@ -75,7 +75,7 @@ def save(folder: Path, training: Training, extras: Extras) -> Path:
     state = training.optimizer.state_dict()["state"]
     for index, name in enumerate(names):
         for key, value in state.get(index, {}).items():
-            tensors[f"{_ADAM}{name}.{key}"] = value.detach().numpy().copy()
+            tensors[f"{_ADAM}{name}.{key}"] = value.detach().cpu().numpy().copy()
     for which in _MOMENTS:
         moments: Moments = getattr(training, which)
         tensors[f"{which}.mean"], tensors[f"{which}.var"] = np.array(moments.mean), np.array(moments.var)

@@ -13,6 +13,7 @@ from services.learner.budget import BudgetConfig
 
 LAST_STAGE = 3
 EvaluatedWeights = Literal["mean", "newest"]
+Device = Literal["auto", "cpu", "cuda"]
 
 
 class PPOConfig(BaseModel):
@@ -50,7 +51,7 @@ class PPOConfig(BaseModel):
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto",
         description="of the update's matrix products (weights, losses and Adam are float32); auto: bfloat16 where the "
-        "CPU multiplies it natively",
+        "device multiplies it natively",
     )
     threads: int = Field(
         1,
@@ -222,6 +223,10 @@ class LearnerOptions(BaseModel):
         "",
         description="policy that a new run starts from, by its name in the box or its folder: with its "
         "network.units and observation, in its stage; empty: new weights",
+    )
+    device: Device = Field(
+        "cpu",
+        description="where updates compute; auto: on a GPU where PyTorch finds one, otherwise on the CPU",
     )
     ppo: PPOConfig = PPOConfig()
     curriculum: CurriculumConfig = CurriculumConfig()

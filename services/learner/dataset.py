@@ -11,14 +11,15 @@ from torch import Tensor
 
 from common.comms.messages import Rollout
 from common.policy.actor_critic import log_prob
-from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.advantage import gae
 from services.learner.config import PPOConfig
+from services.learner.engine import Engine
 from services.learner.epoch_stats import PlayStats, merged, play_counts
 from services.learner.group import ALONE, Group
-from services.learner.ppo import Dataset, Share, are_any, denormalized, explained_variance, weight_sum
+from services.learner.minibatches import Dataset, Share, are_any, weight_sum
+from services.learner.ppo import denormalized, explained_variance
 
 Floats = npt.NDArray[np.float32]
 OF_PARTS: Final = (
@@ -35,7 +36,7 @@ OF_PARTS: Final = (
 class Model:
     """The network before its update, with the moments that normalise its inputs and values."""
 
-    network_pass: NetworkPass
+    engine: Engine
     obs_moments: Moments
     value_moments: Moments
     obs_size: int
@@ -46,7 +47,7 @@ class Model:
         """Return the critic's values [reward] of observations (N, D)."""
         if len(obs) == 0:
             return np.zeros(0, np.float32)
-        _, value = self.network_pass.evaluate(torch.from_numpy(normalize(obs, self.obs_moments)))
+        _, value = self.engine.evaluate(torch.from_numpy(normalize(obs, self.obs_moments)))
         return denormalized(value, self.value_moments)
 
 
@@ -105,7 +106,7 @@ def read(
         version: Of the policy before the update.
         on_tick: Called between rollouts.
     """
-    log_std = model.network_pass.network.log_std.detach().clone()
+    log_std = model.engine.network.log_std.detach().clone()
     parts = []
     for rollout in rollouts:
         parts.append(_part(rollout, model, distillation, log_std))
@@ -158,9 +159,9 @@ def _moments(row: npt.NDArray[np.float64]) -> Moments:
 def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor) -> _Part:
     ppo, steps, count = model.ppo, *r.rewards.shape
     obs = torch.from_numpy(normalize(r.obs, model.obs_moments).reshape(-1, model.obs_size))
-    obs = obs.to(model.network_pass.dtype)
+    obs = obs.to(model.engine.dtype)
     actions = torch.tensor(r.actions.reshape(-1, r.actions.shape[-1]))
-    mean, value = model.network_pass.evaluate(obs)
+    mean, value = model.engine.evaluate(obs)
     values = denormalized(value, model.value_moments).reshape(steps, count)
     final = np.zeros(steps * count, np.float32)
     final[r.final_index] = model.values(r.final_obs)
@@ -193,10 +194,10 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
 def _nothing(model: Model) -> _Part:
     """Return no frames at all: of a rank whose actors have brought nothing for this dataset."""
     none = torch.zeros(0)
-    network = model.network_pass.network
+    network = model.engine.network
     actions = torch.zeros((0, len(network.log_std)))
     return _Part(
-        obs=torch.zeros((0, model.obs_size), dtype=model.network_pass.dtype),
+        obs=torch.zeros((0, model.obs_size), dtype=model.engine.dtype),
         actions=actions,
         log_mu=none,
         log_prox=none,

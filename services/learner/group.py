@@ -48,6 +48,10 @@ class Links(Protocol):
         """Replace ``values`` (n,), contiguous, by their sum over the ranks: the same bits on each."""
         ...
 
+    def add_tensor(self, values: Any) -> None:
+        """Do the same with a tensor (n,), contiguous, on any device."""
+        ...
+
     def close(self) -> None:
         """Close them."""
         ...
@@ -79,6 +83,12 @@ class Group:
         if self.links is not None:
             with self._together():
                 self.links.add(values)
+
+    def add_tensor(self, values: Any) -> None:
+        """Replace a tensor (n,), contiguous, by its sum over the ranks, on the device that it is on."""
+        if self.links is not None:
+            with self._together():
+                self.links.add_tensor(values)
 
     def gathered(self, *arrays: Array, on_tick: Callable[[], None] | None = None) -> list[list[Array]]:
         """Return every rank's arrays, in the order of ranks, by one message; of other ranks they are read-only.

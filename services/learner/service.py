@@ -201,6 +201,10 @@ class LearnerService:
             config.frames or config.curriculum.frames,
             *(config.run, self._link) * 2,
         )
+        compute = self.training.compute
+        log.info(
+            "updates device=%s precision=%s threads=%d", compute.device, compute.precision, compute.threads
+        )
         if config.resume and (spent := self._spent(self.seconds, ENDING_S)):
             log.warning(NOTHING_LEFT, spent, "")
             self._has_nothing_left = True

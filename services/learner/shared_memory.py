@@ -21,6 +21,8 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 MAILBOX: Final = 2**20  # bytes of a mailbox; what is longer goes in pieces
 HEADER: Final = 64  # its first bytes: how many bytes are still to come; the rest of them aligns what follows
@@ -78,6 +80,12 @@ class SharedMemoryLinks:
         step = ROOM // values.itemsize
         for start in range(0, len(values), step):
             self._add(values[start : start + step])
+
+    def add_tensor(self, values: Tensor) -> None:
+        """Do the same with a tensor (n,), contiguous, on any device: by way of the CPU's memory."""
+        own = values.cpu().numpy()
+        self.add(own)
+        values.copy_(torch.from_numpy(own))
 
     def close(self) -> None:
         """Close the sockets; the memory is freed when the last rank has left it."""

@@ -1,4 +1,7 @@
-"""Links between the ranks of several machines: torch.distributed, as torchrun has set it up."""
+"""Links between the ranks of several machines: torch.distributed, as torchrun has set it up.
+
+Gloo sums what is in the CPU's memory, and NCCL what is on a GPU.
+"""
 
 from collections.abc import Callable
 from datetime import timedelta
@@ -12,7 +15,7 @@ from torch import Tensor
 
 
 class TorchLinks:
-    """Links of one rank to all the others, over gloo.
+    """Links of one rank to all the others.
 
     Args:
         rank: This one.
@@ -25,8 +28,10 @@ class TorchLinks:
 
     def __init__(self, rank: int, size: int, timeout_s: float) -> None:
         self._size = size
+        has_nccl = torch.cuda.is_available() and torch.distributed.is_nccl_available()
+        backends = "cpu:gloo,cuda:nccl" if has_nccl else "gloo"
         torch.distributed.init_process_group(
-            "gloo", "env://", rank=rank, world_size=size, timeout=timedelta(seconds=timeout_s)
+            backends, "env://", rank=rank, world_size=size, timeout=timedelta(seconds=timeout_s)
         )
 
     def exchanged(self, own: bytes, on_tick: Callable[[], None] | None = None) -> list[bytes]:
@@ -47,6 +52,10 @@ class TorchLinks:
     def add(self, values: npt.NDArray[Any]) -> None:
         """Replace ``values`` (n,), contiguous, by their sum over the ranks: the same bits on each."""
         torch.distributed.all_reduce(torch.from_numpy(values))
+
+    def add_tensor(self, values: Tensor) -> None:
+        """Do the same with a tensor (n,), contiguous, on any device."""
+        torch.distributed.all_reduce(values)
 
     def close(self) -> None:
         """Leave torch's process group."""

@@ -14,14 +14,13 @@ from common.env.robot import home_action
 from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
 from common.policy.folder import Policy
-from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.task.experience import TeacherConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, critic_layout, size
 from services.learner.admission import LearnerState
+from services.learner.compute import Compute, compute_of, new_engine
 from services.learner.config import (
-    CurriculumConfig,
     DivergenceConfig,
     EvaluatedWeights,
     LearnerConfig,
@@ -30,9 +29,10 @@ from services.learner.config import (
 from services.learner.curriculum import StageLengths, Trained, decayed
 from services.learner.dataset import Batch, Distillation, Model, read
 from services.learner.divergence import Health, divergence, running_mean, watched
+from services.learner.engine import Engine
 from services.learner.epoch_stats import EpochStats, Progress
 from services.learner.group import ALONE, Group
-from services.learner.ppo import LearningRate, UpdateMode, precision_of, update
+from services.learner.ppo import LearningRate, UpdateMode, update
 from services.learner.start_policy import start_policy
 
 Floats = npt.NDArray[np.float32]
@@ -49,30 +49,31 @@ class Training:
     Args:
         ppo: Hyper-parameters.
         network: Network's shape.
-        curriculum: Stage lengths.
+        stages: How long they are, and what happens between them.
         home_action: Initial bias of the mean head (7,).
         seed: Of the network's initial weights and the minibatches' shuffle.
         notice: Datasets that a stage still takes after its gate has opened: actors already collect them.
         observation: What policy and critic observe.
         divergence: When training counts as diverged.
         teacher: The policy that it learns from first, if any.
-        frames: That the run may train; 0: not set.
+        compute: What updates compute with; None: the CPU, as ``ppo`` says.
     """
 
     def __init__(
         self,
         ppo: PPOConfig,
         network: NetworkConfig,
-        curriculum: CurriculumConfig,
+        stages: StageLengths,
         home_action: Floats,
         seed: int,
         notice: int = 1,
         observation: ObservationConfig = PAPER_OBSERVATION,
         divergence: DivergenceConfig = DivergenceConfig(),
         teacher: TeacherConfig = TeacherConfig(),
-        frames: int = 0,
+        compute: Compute | None = None,
     ) -> None:
-        torch.set_num_threads(ppo.threads)
+        self.compute = compute or compute_of(ppo)
+        torch.set_num_threads(self.compute.threads)
         with torch.random.fork_rng():
             torch.manual_seed(seed)
             self.network: ActorCritic = new_network(network, observation, home_action)
@@ -82,21 +83,17 @@ class Training:
         self.network_config = network
         self.obs_size = size(critic_layout(observation))
         self.ppo = ppo
-        self.curriculum = curriculum
-        self.stages = StageLengths(curriculum, frames)
+        self.stages, self.curriculum = stages, stages.config
         self.notice = notice
         self.divergence = divergence
         self.teacher = teacher
         # The learners that train together: set before the first epoch. All are made with the same arguments.
         self.group: Group = ALONE
-        self.network_pass = NetworkPass(self.network, ppo.minibatch, precision_of(ppo))
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=ppo.learning_rate, eps=1e-8, fused=True
-        )
+        self.engine: Engine = new_engine(self.network, ppo, self.compute)
         self.generator = torch.Generator().manual_seed(seed)
         self.obs_moments = Moments.initial(self.obs_size)
         self.value_moments = Moments(np.array(0.0), np.array(1.0), 1)
-        self.progress = Progress(stage=curriculum.first_stage, learning_rate=ppo.learning_rate)
+        self.progress = Progress(stage=self.curriculum.first_stage, learning_rate=ppo.learning_rate)
         self.has_start_policy = False  # whether the run began with a trained policy
 
     @torch.no_grad()
@@ -111,9 +108,14 @@ class Training:
                 network.policy_parameters(), policy.network.policy_parameters(), strict=True
             ):
                 own.copy_(theirs)
-        self.network_pass.refresh()
+        self.engine.refresh()
         self.obs_moments = policy.moments.followed_by(self.obs_moments).recounted()
         self.progress = replace(self.progress, learning_rate=self.ppo.learning_rate_min, refitting=True)
+
+    @property
+    def optimizer(self) -> torch.optim.Optimizer:
+        """The optimiser of the network's parameters."""
+        return self.engine.optimizer
 
     @property
     def datasets_left(self) -> int:
@@ -174,8 +176,7 @@ class Training:
             else UpdateMode.PPO
         )
         stats = update(
-            self.network_pass,
-            self.optimizer,
+            self.engine,
             batch.data,
             ppo,
             LearningRate(self._rate(mode, bound), bound),
@@ -235,10 +236,8 @@ class Training:
 
     def read(self, rollouts: Sequence[Rollout], on_tick: Callable[[], None] = lambda: None) -> Batch:
         """Return the data of the next epoch from its rollouts; nothing is changed."""
-        self.network_pass.refresh()
-        model = Model(
-            self.network_pass, self.obs_moments, self.value_moments, self.obs_size, self.ppo, self.group
-        )
+        self.engine.refresh()
+        model = Model(self.engine, self.obs_moments, self.value_moments, self.obs_size, self.ppo, self.group)
         distillation = Distillation(self.teacher, self.is_distilling)
         return read(rollouts, model, distillation, self.progress.version, on_tick)
 
@@ -312,14 +311,14 @@ def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
     training = Training(
         config.ppo,
         config.network,
-        config.curriculum,
+        StageLengths(config.curriculum, config.frames),
         home_action(config.task.robot),
         config.seed,
         notice=max(1, config.intake.lag_aimed_at),
         observation=config.task.observation,
         divergence=config.divergence,
         teacher=config.experience.teacher,
-        frames=config.frames,
+        compute=compute_of(config.ppo, config.device),
     )
     training.group = group
     training.has_start_policy = bool(config.start_policy)

@@ -11,7 +11,7 @@ from topspin.report.collect import Run
 BOOKKEEPING: Final = frozenset(
     {
         *("run", "recipe", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
-        *("silence_warning_s", "checkpoint_interval_s", "writers"),
+        *("silence_warning_s", "checkpoint_interval_s", "writers", "device"),
         *("endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib"),
         *("tls", "metrics_host", "log_level", "status_interval_s"),
     }

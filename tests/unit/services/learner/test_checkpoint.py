@@ -12,13 +12,16 @@ from common.policy.config import NetworkConfig
 from services.learner import checkpoint
 from services.learner.checkpoint import CheckpointError, DamagedCheckpointError, Extras
 from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.training import Training
 
 EXTRAS = Extras("r", 5, [], [], 1.5, closed=(("a", 3),), queue=(b"one", b"another"))
 
 
 def make_training(units=(8, 8)):
-    return Training(PPOConfig(), NetworkConfig(units=units), CurriculumConfig(), np.zeros(7, np.float32), 0)
+    return Training(
+        PPOConfig(), NetworkConfig(units=units), StageLengths(CurriculumConfig()), np.zeros(7, np.float32), 0
+    )
 
 
 def saved(folder, versions):

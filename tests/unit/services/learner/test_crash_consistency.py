@@ -16,6 +16,7 @@ from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.learner import checkpoint
 from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.generation import next_generation
 from services.learner.run_log import RunLog
 from services.learner.training import Training
@@ -42,7 +43,7 @@ def at_version(version, fill):
     training = Training(
         PPOConfig(),
         NetworkConfig(units=(8, 8)),
-        CurriculumConfig(),
+        StageLengths(CurriculumConfig()),
         np.zeros(7, np.float32),
         0,
         observation=TaskConfig().observation,

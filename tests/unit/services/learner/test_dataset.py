@@ -7,13 +7,16 @@ import pytest
 
 from common.policy.config import NetworkConfig
 from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import make_rollout
 
 
 def make_training(**ppo):
     settings = PPOConfig(minibatch=64, **{"mini_epochs": 1, "gae_lambda": 0.0, "precision": "float32", **ppo})
-    return Training(settings, NetworkConfig(units=(16, 8)), CurriculumConfig(), np.zeros(7, np.float32), 0)
+    return Training(
+        settings, NetworkConfig(units=(16, 8)), StageLengths(CurriculumConfig()), np.zeros(7, np.float32), 0
+    )
 
 
 def rollouts_of(mean, spread):

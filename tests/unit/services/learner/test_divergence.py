@@ -9,6 +9,7 @@ from common.policy.normalizer import normalize
 from services.learner import checkpoint
 from services.learner.checkpoint import Extras, keep, restore, save
 from services.learner.config import CurriculumConfig, DivergenceConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.divergence import Health, divergence, watched
 from services.learner.epoch_stats import Progress
 from services.learner.training import Training
@@ -29,7 +30,7 @@ def make_training(limits=LIMITS, curriculum=CurriculumConfig(), **ppo):
     return Training(
         PPOConfig(**{"minibatch": 64, "mini_epochs": 2, **ppo}),
         NetworkConfig(units=(16, 8)),
-        curriculum,
+        StageLengths(curriculum),
         np.zeros(7, np.float32),
         0,
         divergence=limits,

@@ -12,7 +12,8 @@ from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
 from common.policy.weights import new_network
 from services.learner.config import PPOConfig
-from services.learner.ppo import Dataset, LearningRate, UpdateMode, minibatches, whole
+from services.learner.minibatches import Dataset, minibatches, whole
+from services.learner.ppo import LearningRate, UpdateMode
 from tests.unit.services.learner.test_ppo import make_data, update
 
 RATE = 1e-3

@@ -81,6 +81,9 @@ def summed(group: Group) -> None:
         group.add(numbers)
         expected = group.size * np.arange(count) + 1000.0 * sum(range(group.size))
         np.testing.assert_array_equal(numbers, expected)
+        tensor = torch.arange(float(count)) + 1000.0 * group.rank
+        group.add_tensor(tensor)
+        np.testing.assert_array_equal(tensor.numpy(), expected)
 
 
 def rank_main(rank: int, size: int, where: dict[str, str], ppo: PPOConfig, results: Connection) -> None:

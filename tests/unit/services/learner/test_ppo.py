@@ -6,30 +6,19 @@ import torch
 
 from common.policy.actor_critic import log_prob
 from common.policy.config import NetworkConfig
-from common.policy.network_pass import NetworkPass
 from common.policy.weights import new_network
+from services.learner.compute import compute_of
 from services.learner.config import PPOConfig
-from services.learner.ppo import (
-    Dataset,
-    LearningRate,
-    UpdateMode,
-    adapted_learning_rate,
-    explained_variance,
-    kl_sum,
-    precision_of,
-)
+from services.learner.engine import CpuEngine, kl_sum
+from services.learner.minibatches import Dataset
+from services.learner.ppo import LearningRate, UpdateMode, adapted_learning_rate, explained_variance
 from services.learner.ppo import update as update_by
 
 
 def update(network, optimizer, data, config, *arguments, **named):
-    return update_by(
-        NetworkPass(network, config.minibatch, precision_of(config)),
-        optimizer,
-        data,
-        config,
-        *arguments,
-        **named,
-    )
+    """Update with an optimiser of the network's parameters, which keeps its moments from call to call."""
+    engine = CpuEngine(network, lambda _: optimizer, config.minibatch, compute_of(config).precision)
+    return update_by(engine, data, config, *arguments, **named)
 
 
 @pytest.mark.parametrize(

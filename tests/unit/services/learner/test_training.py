@@ -13,6 +13,7 @@ from common.policy.normalizer import Moments, normalize
 from common.task.experience import TeacherConfig
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
 from services.learner.config import CurriculumConfig, PPOConfig
+from services.learner.curriculum import StageLengths
 from services.learner.epoch_stats import play_stats
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
@@ -26,7 +27,7 @@ EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_second
 
 def make_training(seed=0, ppo=PPO, curriculum=CURRICULUM, frames=0):
     return Training(
-        ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), seed, frames=frames
+        ppo, NetworkConfig(units=(16, 8)), StageLengths(curriculum, frames), np.zeros(7, np.float32), seed
     )
 
 
@@ -164,7 +165,9 @@ def test_the_mean_of_old_weights_covers_100_datasets():
 def test_a_gate_that_opens_near_the_stages_end_promises_no_more_datasets_than_it_has():
     """Actors collect what is promised, and a dataset of the stage before would be lost."""
     curriculum = CURRICULUM.model_copy(update={"catch_gate": 1e-6})
-    training = Training(PPO, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0, notice=4)
+    training = Training(
+        PPO, NetworkConfig(units=(16, 8)), StageLengths(curriculum), np.zeros(7, np.float32), 0, notice=4
+    )
     promised = []
     for epoch in range(3):
         training.run_epoch(dataset(epoch))
@@ -186,7 +189,9 @@ def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
         ppo = PPO.model_copy(
             update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
         )
-        training = Training(ppo, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
+        training = Training(
+            ppo, NetworkConfig(units=(16, 8)), StageLengths(curriculum), np.zeros(7, np.float32), 0
+        )
         for epoch in range(3):
             training.run_epoch(dataset(epoch))
         before, value_before = outputs(training)
@@ -253,7 +258,7 @@ def test_an_unusable_checkpoint_is_refused_with_one_line(tmp_path, damage, messa
 
 def test_a_checkpoint_of_another_network_is_refused_with_the_parameter_that_differs(tmp_path):
     path = save(tmp_path, make_training(), EXTRAS)
-    other = Training(PPO, NetworkConfig(units=(16, 9)), CURRICULUM, np.zeros(7, np.float32), 0)
+    other = Training(PPO, NetworkConfig(units=(16, 9)), StageLengths(CURRICULUM), np.zeros(7, np.float32), 0)
 
     with pytest.raises(CheckpointError, match=r"doesn't fit this configuration: weights '.*' have shape"):
         restore(path, other)
@@ -355,7 +360,9 @@ def test_after_distillation_a_policy_learns_from_rewards_with_small_steps_and_no
 @pytest.mark.parametrize("aiming_log_std", [-2.5, -1.0])
 def test_the_action_noise_is_bounded_from_stage_3_on_and_not_before(aiming_log_std):
     curriculum = CURRICULUM.model_copy(update={"aiming_log_std": aiming_log_std})
-    training = Training(PPO, NetworkConfig(units=(16, 8)), curriculum, np.zeros(7, np.float32), 0)
+    training = Training(
+        PPO, NetworkConfig(units=(16, 8)), StageLengths(curriculum), np.zeros(7, np.float32), 0
+    )
     noises = {}
     for epoch in range(6):
         stage = training.run_epoch(dataset(epoch)).progress.stage
