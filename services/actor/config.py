@@ -97,4 +97,9 @@ class ActorConfig(ServiceConfig, Fleet, ActorOptions):
     @property
     def env_count(self) -> int:
         """How many environments this actor plays."""
-        return self.envs or max(FEWEST_ENVS, ENVS // self.actors)
+        return env_count(self.envs, self.actors)
+
+
+def env_count(envs: int, actors: int) -> int:
+    """Return how many environments each of so many actors plays, by the setting ``envs``."""
+    return envs or max(FEWEST_ENVS, ENVS // actors)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from services.actor.config import env_count
 from services.learner.config import LAST_STAGE
 from topspin.report.collect import Run
 
@@ -44,12 +45,19 @@ SPINS: Final[Mapping[str, list[str]]] = {"hidden": [], "estimated": ["estimated 
 
 
 def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run that define the experiment, by dotted path."""
-    return {
+    """Return the settings of a run that define the experiment, by dotted path.
+
+    Of actors and their environments it is the product that counts: 2 actors of 128 make the datasets of one of 256.
+    """
+    found = {
         path: value
         for path, value in leaves(settings)
         if path.split(".")[0] != EVALUATOR and path.split(".")[-1] not in BOOKKEEPING
     }
+    if "actors" in found and not found.get("learner.intake.dataset_rollouts"):
+        actors = found.pop("actors")
+        found["environments"] = actors * env_count(found.pop("actor.envs", 0), actors)
+    return found
 
 
 def stages_of(runs: Sequence[Run]) -> str:

@@ -37,7 +37,18 @@ def test_runs_of_the_recipe_are_one_rung_whatever_their_seed_and_length():
         [
             finished("a", "--recipe", "paper", final=FINAL | {"return_rate": 0.7}),
             finished("b", "--recipe", "paper", "--seed", "1", "--frames", "2000"),
-            finished("c", "--recipe", "paper", "--seed", "2", final=FINAL | {"target_error_mean": None}),
+            finished(
+                "c",
+                "--recipe",
+                "paper",
+                "--actors",
+                "2",
+                "--actor.envs",
+                "736",
+                "--seed",
+                "2",
+                final=FINAL | {"target_error_mean": None},
+            ),
         ]
     )
 
@@ -116,7 +127,7 @@ def test_a_run_without_measures_is_named():
 def test_a_setting_that_the_run_lacks_is_a_difference():
     known = known_settings()
 
-    assert label({}, known).startswith("paper with actor.envs unset")
+    assert label({}, known).startswith("paper with actor.history unset, actor.horizon unset")
 
 
 def test_the_line_is_json(capsys):

@@ -126,7 +126,22 @@ def test_runs_that_differ_only_in_seed_name_and_connection_are_one_experiment():
 
 
 def test_evaluation_settings_make_no_experiment():
-    assert experiment({"evaluator": {"rallies": 9}, "actors": 2}) == {"actors": 2}
+    assert experiment({"evaluator": {"rallies": 9}, "task": {"rounds": 2}}) == {"task.rounds": 2}
+
+
+@pytest.mark.parametrize(
+    ("actors", "envs", "environments"), [(1, 0, 256), (2, 0, 256), (2, 128, 256), (64, 0, 1024), (3, 10, 30)]
+)
+def test_of_actors_the_number_of_all_environments_makes_the_experiment(actors, envs, environments):
+    found = experiment({"actors": actors, "actor": {"envs": envs}})
+
+    assert found == {"environments": environments}
+
+
+def test_where_a_dataset_is_a_number_of_rollouts_actors_and_their_environments_count_each():
+    settings = {"actors": 2, "actor": {"envs": 9}, "learner": {"intake": {"dataset_rollouts": 4}}}
+
+    assert experiment(settings) == {"actors": 2, "actor.envs": 9, "learner.intake.dataset_rollouts": 4}
 
 
 def observing(**options):
