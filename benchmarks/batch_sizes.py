@@ -48,7 +48,11 @@ class BatchSizesConfig(BenchmarkConfig):
         description="a training that needs more has missed the goal",
         json_schema_extra={"unit": "frames"},
     )
-    run: str = Field("", description="name of the runs, before -SIZE-SEED; empty: a time stamp")
+    run: str = Field(
+        "",
+        description="name of the runs, before -SIZE-SEED; empty: a time stamp. A run of this name that was "
+        "stopped goes on",
+    )
     more: str = Field("", description="more flags of deploy.local")
     out: Path = Field(FILE, description="file of the trainings")
     train: bool = Field(True, description="false: print what is there")
@@ -91,12 +95,13 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
         if stop.is_set():
             break
         flags = [*flags_of(size), "--frames", str(config.frames), *shlex.split(config.more)]
-        found = train(
-            TimeToQualityConfig(minutes=1e6, more=shlex.join(flags)), f"{base}-{size}-{seed}", seed, stop
-        )
+        settings = TimeToQualityConfig(minutes=1e6, more=shlex.join(flags))
+        found = train(settings, f"{base}-{size}-{seed}", seed, stop, resumes=True)
         if stop.is_set() and not found["reached"]:
             break  # it was stopped, and says nothing
-        point = Point(dataset=size, frames=found["frames"] if found["reached"] else None, seed=seed)
+        point = Point(
+            dataset=size, frames=found["frames"] if found["reached"] else None, seed=seed, more=config.more
+        )
         points = (*points, point)
         write_whole(config.out, LargeBatches(**goal, points=points).model_dump_json(indent=1) + "\n")
         print(f"dataset {size}  seed {seed}  frames {point.frames}", file=sys.stderr, flush=True)

@@ -16,7 +16,7 @@ from pydantic import Field
 from benchmarks.settings import BenchmarkConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import RallyBatch
-from common.task.config import PresetName, Randomization, TaskConfig
+from common.task.config import FlightName, PresetName, Randomization, TaskConfig
 from common.task.launch import draw_rallies
 
 
@@ -26,6 +26,7 @@ class Speed:
 
     launch: str  # preset
     randomization: str  # profile
+    flight: str  # model of the air
     batch: int  # rallies per message
     rallies: int  # valid rallies that passed the codec
     candidates: int  # launches drawn for them
@@ -52,9 +53,9 @@ def batch_on_the_wire(task: TaskConfig, size: int, seed: int, block: int) -> tup
     return decode(payload, RallyBatch), len(payload)
 
 
-def measure(launch: str, randomization: str, size: int, seed: int, seconds: float) -> Speed:
+def measure(launch: str, randomization: str, flight: str, size: int, seed: int, seconds: float) -> Speed:
     """Draw blocks for ``seconds`` and return the number of rallies."""
-    task = TaskConfig.model_validate({"launch": launch, "randomization": randomization})
+    task = TaskConfig.model_validate({"launch": launch, "randomization": randomization, "flight": flight})
     batch_on_the_wire(task, 1, seed, 0)  # compiles the kernels
     rallies = candidates = n_bytes = block = 0
     start = time.perf_counter()
@@ -66,7 +67,7 @@ def measure(launch: str, randomization: str, size: int, seed: int, seconds: floa
         n_bytes += received_bytes
         block += 1
         elapsed = time.perf_counter() - start
-    return Speed(launch, randomization, size, rallies, candidates, n_bytes, elapsed)
+    return Speed(launch, randomization, flight, size, rallies, candidates, n_bytes, elapsed)
 
 
 class GeneratorConfig(BenchmarkConfig):
@@ -78,6 +79,7 @@ class GeneratorConfig(BenchmarkConfig):
 
     launch: PresetName = Field("paper", description="launch preset")
     randomization: Randomization = Field("standard", description="profile with the ranges of drag and lift")
+    flight: FlightName = Field("full", description="model of the air")
     batch: int = Field(500, ge=1, description="valid rallies per message")
     seed: int = Field(0, ge=0, lt=2**63, description="of the blocks")
     seconds: float = Field(
@@ -87,7 +89,9 @@ class GeneratorConfig(BenchmarkConfig):
 
 def main(config: GeneratorConfig, _stop: Event) -> int:
     """Measure and print."""
-    speed = measure(config.launch, config.randomization, config.batch, config.seed, config.seconds)
+    speed = measure(
+        *(config.launch, config.randomization, config.flight), config.batch, config.seed, config.seconds
+    )
     valid_per_s = speed.rallies / speed.seconds
     share = speed.rallies / speed.candidates
     if config.json_line:
@@ -101,7 +105,8 @@ def main(config: GeneratorConfig, _stop: Event) -> int:
     else:
         print(
             f"{valid_per_s:,.0f} valid rallies/s, {share:.1%} of the candidates "
-            f"({speed.launch}, randomization {speed.randomization}, {speed.rallies:,} in {speed.seconds:.1f} s)"
+            f"({speed.launch}, randomization {speed.randomization}, air {speed.flight}, "
+            f"{speed.rallies:,} in {speed.seconds:.1f} s)"
         )
     return 0
 

@@ -134,7 +134,7 @@ def deploy_config(tls: str, number: int) -> DeployConfig:
         network=NetworkConfig(units=(32, 16)),
         actor=ActorOptions(envs=32, horizon=16),
         learner=LearnerOptions(
-            ppo=PPOConfig(minibatch=256, refit_epochs=1),
+            ppo=PPOConfig(minibatch=256, refit_frames=1),
             curriculum=CurriculumConfig(stage_1=10**9),
         ),
     )

@@ -102,7 +102,7 @@ class Site:
                 "history": str(self.history),
                 "checkpoint_interval_s": 3.0,
                 "intake": {"max_lag": MAX_LAG},
-                "ppo": {"minibatch": 256, "refit_epochs": 1},
+                "ppo": {"minibatch": 256, "refit_frames": 1},
                 "curriculum": {"stage_1": 150_000, "stage_2": 150_000, "stage_3": 10**12},
             },
             "actor": {"history": str(self.history), "envs": ENVS, "horizon": HORIZON},

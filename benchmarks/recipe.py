@@ -28,6 +28,7 @@ from topspin.report.collect import find
 from topspin.report.groups import experiment
 
 BASE: Final = "paper"
+FINAL: Final = "final"  # of a run that trained to its end
 MEASURES: Final = ("return_rate", "return_after_catch", "target_error_mean")
 
 
@@ -97,7 +98,7 @@ def result(folder: RunFolder) -> dict[str, Any]:
         ReportedError: It has none.
     """
     name = folder.root.name
-    measured = "final"
+    measured = FINAL
     try:
         found = json.loads(folder.final.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -136,8 +137,8 @@ def rungs(folders: Sequence[RunFolder]) -> dict[str, Any]:
 
 
 def median(runs: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    """Return the median of one measure over the runs that have it, or None."""
-    values = [run[key] for run in runs if run[key] is not None]
+    """Return the median of one measure over the runs that ended and have it, or None."""
+    values = [run[key] for run in runs if run[key] is not None and run["measured"] == FINAL]
     return round(statistics.median(values), 4) if values else None
 
 
@@ -153,14 +154,21 @@ def main(config: RecipeConfig, stop: Event) -> int:
         raise ReportedError(
             "no run to compare; give folders, as in: python -m benchmarks.recipe runs/paper-0"
         )
-    found = rungs([find(name) for name in dict.fromkeys(config.runs)])
+    folders = {folder.root: folder for folder in map(find, config.runs)}  # each once, under whatever names
+    found = rungs(list(folders.values()))
     if config.json_line:
         print(json.dumps(found))
         return DONE
     for rung in found["ladder"]:
         print(rung["label"])
-        for one in (*rung["runs"], {"run": "median", "seed": "", "frames": "", **rung["median"]}):
-            print("  " + "  ".join(f"{one[key]!s:>20}" for key in ("run", "seed", "frames", *MEASURES)))
+        for one in (
+            *rung["runs"],
+            {"run": "median", "seed": "", "frames": "", "measured": "", **rung["median"]},
+        ):
+            print(
+                "  "
+                + "  ".join(f"{one[key]!s:>20}" for key in ("run", "seed", "frames", *MEASURES, "measured"))
+            )
     return DONE
 
 

@@ -6,7 +6,9 @@ Each seed is a real run of `deploy.local`, one after the other. Its evaluator's 
 reached the goal: 81 % of 1,000 balls returned, 0.31 m from the target. That policy then plays 1,000 other balls while
 training goes on, and the time counts only if it meets the goal on these as well: balls that choose a policy flatter
 it. The figures printed for a run are those of a third set of balls. Time is wall time from the start of the command,
-with imports and start-up. A run that does not reach the goal counts as slower than all that do.
+with imports and start-up. A run that does not reach the goal counts as slower than all that do. Balls, noise and
+contacts are those of the training (``--more``). Each seed's figures are kept with its run: with ``--run NAME`` the
+program goes on where it was stopped, with the next seed.
 """
 
 import csv
@@ -28,12 +30,15 @@ from pydantic import Field
 from benchmarks.settings import BenchmarkConfig, run
 from common.errors import ReportedError
 from common.policy.contract import PolicyError
-from common.policy.folder import load_policy
+from common.policy.folder import load_policy, save_policy
 from common.service.run_folder import RunFolder
 from common.service.table import whole_rows
+from common.service.whole_file import write_whole
+from common.task.config import MatchConditions
 
 RETURN_RATE, TARGET_ERROR = 0.81, 0.31  # [share], [m] the paper's table
 LOOK_S: Final = 1.0
+SAVED_S: Final = 10.0  # in which the policy of a row is written
 PATIENCE_S: Final = 180.0  # in which a run ends and measures its policy
 RALLIES: Final = 1000
 # The run's evaluator chooses on the rallies of the run's seed. These are other ones:
@@ -61,7 +66,11 @@ class TimeToQualityConfig(BenchmarkConfig):
     minutes: float = Field(
         60.0, gt=0, description="limit of each training", json_schema_extra={"unit": "min"}
     )
-    run: str = Field("", description="name of the runs, before -SEED; empty: a time stamp")
+    run: str = Field(
+        "",
+        description="name of the runs, before -SEED; empty: a time stamp. Runs of this name that were measured with "
+        "the same settings are not trained again",
+    )
     return_rate: float = Field(RETURN_RATE, ge=0, le=1, description="goal; default: the paper's")
     target_error: float = Field(
         TARGET_ERROR, gt=0, description="goal; default: the paper's", json_schema_extra={"unit": "m"}
@@ -102,60 +111,105 @@ def first_passage(
     return curve[-1] if is_confirmed(curve[-1]) else None
 
 
-def is_at_hand(folder: RunFolder, row: Mapping[str, Any]) -> bool:
-    """Return whether the best policy of a run is the one that a row of its curve measured."""
-    try:
-        return load_policy(folder.best_policy).contract.version == int(row["version"])
-    except PolicyError:
-        return False
+def kept(folder: RunFolder, row: Mapping[str, Any], wait_s: float = SAVED_S) -> Path | None:
+    """Return a copy of the policy that a row of a run's curve measured, or None if it is not at hand.
+
+    Training goes on, and a better policy may replace it at any time. The row is written a moment before its policy.
+
+    Args:
+        folder: Of the run.
+        row: Of its curve.
+        wait_s: For the policy.
+    """
+    until = time.monotonic() + wait_s
+    while True:
+        try:
+            policy = load_policy(folder.best_policy)
+        except PolicyError:
+            policy = None
+        if policy is not None and policy.contract.version == int(row["version"]):
+            save_policy(copy := folder.report / "passed", policy.network, policy.moments, policy.contract)
+            return copy
+        if time.monotonic() >= until:
+            return None
+        time.sleep(0.1)
 
 
-def measure(name: str, seed: int) -> dict[str, Any]:
-    """Return the measures of a run's best policy on rallies of ``seed``."""
-    policy = str(RunFolder.of(name).best_policy)
-    arguments = ("--policy", policy, "--rallies", str(RALLIES), "--seed", str(seed), "--json")
-    done = subprocess.run(
-        [sys.executable, "-m", "topspin", "evaluate", *arguments], capture_output=True, text=True, check=True
+def match_flags(policy: Path) -> list[str]:
+    """Return the flags of ``topspin evaluate`` for the conditions under which a policy is trained."""
+    conditions = MatchConditions.model_validate(
+        load_policy(policy).contract.task.model_dump(include=set(MatchConditions.model_fields))
     )
+    named = ((f"--{name.replace('_', '-')}", str(value)) for name, value in conditions)
+    return [text for pair in named for text in pair]
+
+
+def measure(policy: Path, seed: int) -> dict[str, Any]:
+    """Return a policy's measures on rallies of ``seed``, under the conditions of its training."""
+    flags = ["--policy", str(policy), "--rallies", str(RALLIES), "--seed", str(seed), *match_flags(policy)]
+    done = subprocess.run(
+        [sys.executable, "-m", "topspin", "evaluate", *flags, "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        start_new_session=True,  # a Ctrl-C ends the benchmark, which then waits for it
+    )
+    if done.returncode:
+        raise ReportedError(f"measuring {policy} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 
 
-def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dict[str, Any]:
-    """Train a run until the goal or the end of its time, and return its figures."""
+def train(
+    config: TimeToQualityConfig, name: str, seed: int, stop: Event, resumes: bool = False
+) -> dict[str, Any]:
+    """Train a run until the goal or the end of its time, and return its figures.
+
+    Args:
+        config: Settings.
+        name: Of the run.
+        seed: Of the run.
+        stop: Ends it.
+        resumes: Whether a run that is there goes on; its minutes are then those since now.
+    """
     folder, goal = RunFolder.of(name), Goal(config.return_rate, config.target_error)
-    if folder.config.exists():
+    is_there = folder.config.exists()
+    if is_there and not resumes:
         raise ReportedError(f"{folder.root} is there already, and its curve is older; choose another --run")
-    command = [sys.executable, "-m", "deploy.local", "--run", name, "--seed", str(seed), "--panel", "off"]
+    run = ["--run", name, "--resume"] if is_there else ["--run", name, "--seed", str(seed)]
+    command = [sys.executable, "-m", "deploy.local", *run, "--panel", "off"]
     limit = ["--minutes", str(config.minutes), *shlex.split(config.more)]
     started = time.monotonic()
+    seen = len(whole_rows(folder.evaluations)) if is_there else 0
     curve: list[dict[str, Any]] = []
     passage, asked = None, 0
     training = subprocess.Popen(
-        [*command, *limit],
+        [*command, *([] if is_there else limit)],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,  # a Ctrl-C in the terminal reaches it once, from here
     )
+    passed: list[Path] = []
+
+    def is_confirmed(row: Mapping[str, Any]) -> bool:
+        policy = kept(folder, row)
+        if policy is None or not goal.is_met(measure(policy, CONFIRMING_SEED)):
+            return False
+        passed.append(policy)
+        return True
+
     with training as process:
         try:
             while process.poll() is None and passage is None and not stop.is_set():
-                for written in whole_rows(folder.evaluations)[len(curve) :]:
+                for written in whole_rows(folder.evaluations)[seen + len(curve) :]:
                     row: dict[str, Any] = dict(written)
                     row["minutes"] = round((time.monotonic() - started) / 60.0, 2)
                     curve.append(row)
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)
                     print(f"seed {seed}  {shown}", file=sys.stderr, flush=True)
-                passage = first_passage(
-                    *(curve, asked, goal),
-                    lambda row: is_at_hand(folder, row) and goal.is_met(measure(name, CONFIRMING_SEED)),
-                )
+                passage = first_passage(curve, asked, goal, is_confirmed)
                 asked = len(curve)
                 time.sleep(LOOK_S)
-            if passage is not None:
-                reported = measure(
-                    name, REPORTED_SEED
-                )  # of the policy that passed, before a better one comes
         finally:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
@@ -163,8 +217,7 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
     if not curve or (passage is None and training.returncode and not stop.is_set()):
         what = "was not evaluated" if not curve else f"ended with {training.returncode}"
         raise ReportedError(f"training {name} {what}: see {folder.logs}")
-    if passage is None:
-        reported = measure(name, REPORTED_SEED)
+    reported = measure(passed[0] if passed else folder.best_policy, REPORTED_SEED)
     _write(curve, folder.report / "time_to_quality.csv")
     at = passage or curve[-1]
     return {
@@ -175,6 +228,21 @@ def train(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dic
         "frames": int(at["frames"]),
         **{key: reported[key] for key in ("return_rate", "return_after_catch", "target_error_mean")},
     }
+
+
+def measured(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dict[str, Any]:
+    """Return the figures of a run that was measured before, or train and measure it."""
+    file = RunFolder.of(name).report / "time_to_quality.json"
+    asked = config.model_dump(mode="json", include={"minutes", "return_rate", "target_error", "more"})
+    if file.is_file():
+        known = json.loads(file.read_text(encoding="utf-8"))
+        if known["asked"] == asked:
+            found: dict[str, Any] = known["found"]
+            return found
+    found = train(config, name, seed, stop)
+    if found["reached"] or not stop.is_set():
+        write_whole(file, json.dumps({"asked": asked, "found": found}) + "\n")
+    return found
 
 
 def _write(curve: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -198,7 +266,7 @@ def main(config: TimeToQualityConfig, stop: Event) -> int:
     for seed in range(config.seeds):
         if stop.is_set():
             break
-        runs.append(train(config, f"{base}-{seed}", seed, stop))
+        runs.append(measured(config, f"{base}-{seed}", seed, stop))
         print("  ".join(f"{key} {value}" for key, value in runs[-1].items()), file=sys.stderr, flush=True)
     if not runs:
         raise ReportedError("stopped before the first seed")

@@ -37,7 +37,7 @@ NETWORK: Final = ("--network.units", "32,16")
 SMALL: Final = (
     *NETWORK,
     *("--actor.envs", "16", "--actor.horizon", "16"),
-    *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-epochs", "1"),
+    *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-frames", "1"),
     *("--learner.curriculum.stage-1", "150000", "--learner.curriculum.stage-2", "150000"),
     *("--learner.curriculum.stage-3", str(10**12)),
     *("--evaluator.rallies", "20", "--evaluator.envs", "10", "--evaluator.interval-s", "2"),

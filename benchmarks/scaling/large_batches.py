@@ -36,6 +36,7 @@ class Point(BaseModel):
     dataset: int = Field(gt=0, description="frames of a dataset; a minibatch was a quarter of it")
     frames: int | None = Field(gt=0, description="frames to the goal; null: it was not reached")
     seed: int = Field(ge=0)
+    more: str = Field("", description="flags of its training besides those of the dataset's size")
 
 
 class LargeBatches(BaseModel):

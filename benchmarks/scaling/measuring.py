@@ -257,9 +257,11 @@ def _add(rank: int, port: int, sizes: tuple[int, ...], result: Connection) -> No
 def _generator_share(seconds: float, seed: int) -> float:
     """Return the share of a core that publishes the rallies of one actor."""
     options, task = GeneratorOptions(), TaskConfig()
-    generator.measure(task.launch, task.randomization, options.batch, seed, 0.1)  # loads the kernels
+    generator.measure(
+        task.launch, task.randomization, task.flight, options.batch, seed, 0.1
+    )  # loads the kernels
     before = time.process_time()
-    made = generator.measure(task.launch, task.randomization, options.batch, seed, seconds)
+    made = generator.measure(task.launch, task.randomization, task.flight, options.batch, seed, seconds)
     return options.rate_hz * (time.process_time() - before) / made.rallies
 
 

@@ -13,9 +13,8 @@ from common.evaluation.breakdown import breakdown, survival, table
 from common.evaluation.config import MatchConfig
 from common.evaluation.match import environments, evaluation_rallies, match_task, play_match
 from common.evaluation.measures import measures
-from common.evaluation.robot_measures import robot_measures
+from common.evaluation.robot_measures import robot_part
 from common.policy.folder import Policy
-from common.robot.description import describe
 
 
 class StoppedError(ReportedError):
@@ -50,12 +49,8 @@ def measure(
         "policy": str(folder),
         "seconds": round(time.monotonic() - started, 2),
     }
-    robot = describe(task.robot)
-    strain = {}
-    if result.robot is not None and len(result.seeds):
-        names = [joint.name for joint in robot.joint]
-        strain = {"robot": {"name": task.robot} | robot_measures(result.robot, robot.links, names)}
-    return measures(result) | survival(result) | match | strain | {"by": breakdown(result)}
+    found = measures(result) | survival(result) | match
+    return found | robot_part(result.robot, task.robot) | {"by": breakdown(result)}
 
 
 def print_measures(found: dict[str, Any], as_json: bool) -> None:

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from common.env.rally_env import EnvStep, RallyEnv
 from common.physics.chain import racket_state
 from common.rally.hit_correction import BALL_POS, FRESH, JOINT_POS, JOINT_VEL
+from common.robot.description import describe
+from common.task.config import RobotName
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -137,6 +139,9 @@ def robot_measures(record: RobotRecord, links: tuple[str, ...], joints: list[str
     def by(names: tuple[str, ...] | list[str], values: Array, digits: int = 4) -> dict[str, float]:
         return {name: round(float(value), digits) for name, value in zip(names, values, strict=True)}
 
+    def forces(of: Array) -> dict[str, dict[str, float | None]]:
+        return {link: _distribution(of[:, k]) for k, link in enumerate(links)}
+
     hits = record.off_centre[np.isfinite(record.off_centre)]
     deep = record.depth > DEEP
     return {
@@ -146,9 +151,21 @@ def robot_measures(record: RobotRecord, links: tuple[str, ...], joints: list[str
         "self_penetration_by_link": by(links, deep.mean(axis=0)),
         "speed_over_limit_by_joint": by(joints, record.speed.max(axis=0), 3),
         "self_force_n": _distribution(record.self_force.max(axis=1)),
+        "self_force_n_by_link": forces(record.self_force),
         "table_force_n": _distribution(record.table_force.max(axis=1)),
+        "table_force_n_by_link": forces(record.table_force),
         "torque_saturation_by_joint": by(joints, record.saturated.mean(axis=0)),
         "command_clipping_by_joint": by(joints, record.clipped.mean(axis=0)),
         "racket_speed_m_per_s": _distribution(record.racket_speed),
         "rim_hit_share": round(float((hits > RIM).mean()), 4) if hits.size else None,
+    }
+
+
+def robot_part(record: RobotRecord | None, robot: RobotName) -> dict[str, Any]:
+    """Return the part ``robot`` of an evaluation: the robot's name and its measures; nothing without a rally."""
+    if record is None or not len(record.depth):
+        return {}
+    about = describe(robot)
+    return {
+        "robot": {"name": robot} | robot_measures(record, about.links, [joint.name for joint in about.joint])
     }

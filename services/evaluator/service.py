@@ -11,6 +11,7 @@ from common.comms.messages import AVERAGE, PolicySnapshot
 from common.comms.transport import Flow, PendingReply, Reply, Transport
 from common.evaluation.match import evaluation_rallies, play_match
 from common.evaluation.measures import measures
+from common.evaluation.robot_measures import robot_part
 from common.policy.contract import PolicyError, contract_hash, contract_of
 from common.policy.folder import Policy, load_policy, save_policy
 from common.policy.normalizer import Moments
@@ -172,12 +173,13 @@ class EvaluatorService:
             frames=snapshot.frames,
         )
         policy = Policy(self._network, moments, contract)
-        found = measures(play_match(policy, self._rallies, self._task, config.envs, self._on_tick))
+        played = play_match(policy, self._rallies, self._task, config.envs, self._on_tick)
+        found, robot = measures(played), robot_part(played.robot, self._task.robot)
         self.evaluations += 1
         self._report(snapshot, found, self._clock() - started)
         reached = score(snapshot.stage, found)
         if self._best is None or reached > self._best:
-            measured = contract.model_copy(update={"measures": found | {"match": match_of(config)}})
+            measured = contract.model_copy(update={"measures": found | robot | {"match": match_of(config)}})
             try:
                 save_policy(self._folder.best_policy, policy.network, policy.moments, measured)
                 self._best = reached

@@ -18,6 +18,7 @@ from services.learner.minibatches import Dataset
 Array = npt.NDArray[np.float64]
 
 SIZE: Final = len(StepSums._fields)
+HIGHEST: Final = 80.0  # log of a probability ratio: exp of 89 is no float32
 
 
 class DeviceEngine:
@@ -102,7 +103,8 @@ class DeviceEngine:
         if len(batch):
             sums[0] = divergence_sum(batch, moved, self._copy.log_std.detach())
         sums /= count
-        sums[-2], sums[-1] = norm, 1.0
+        sums[-2] = norm
+        sums[-1:] = 1.0  # not sums[-1]: a number that is copied there would be waited for
         return torch.where(is_finite, sums, 0.0)
 
     def sums(self, rows: Sequence[Tensor]) -> Array:
@@ -132,7 +134,8 @@ def losses(
         count: Frames of the minibatch over all ranks.
     """
     weights: LossWeights = plan.weights
-    ratio = torch.exp(log_prob(batch.actions, mean, log_std) - batch.log_prox)
+    # A ratio that overflows would make the gradient NaN where it is clipped
+    ratio = torch.exp((log_prob(batch.actions, mean, log_std) - batch.log_prox).clamp(max=HIGHEST))
     weight = torch.exp(batch.log_prox - batch.log_mu).clamp(max=weights.most_weight)
     clipped = ratio.clamp(1.0 - weights.clip, 1.0 + weights.clip)
     gained = torch.minimum(ratio * batch.advantages, clipped * batch.advantages)

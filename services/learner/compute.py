@@ -44,9 +44,17 @@ def compute_of(
     if device == "cpu" or not has_cuda:
         found, native = torch.device("cpu"), native_precision()
     else:
-        rank = int(environment.get("LOCAL_RANK", environment.get("RANK", "0")))
-        found = torch.device("cuda", rank % torch.cuda.device_count())
-        native = "bfloat16" if torch.cuda.is_bf16_supported() else "float32"
+        rank, gpus = (
+            int(environment.get("LOCAL_RANK", environment.get("RANK", "0"))),
+            torch.cuda.device_count(),
+        )
+        ranks = int(environment.get("LOCAL_WORLD_SIZE", "1"))
+        if ranks > gpus:  # NCCL refuses two ranks of one GPU
+            raise ReportedError(f"device cuda with {ranks} learners and {gpus} GPUs; allowed: up to one each")
+        found = torch.device("cuda", rank % gpus)
+        with torch.cuda.device(found):
+            is_native = torch.cuda.is_bf16_supported(including_emulation=False)
+        native = "bfloat16" if is_native else "float32"
     return Compute(found, native if ppo.precision == "auto" else ppo.precision, ppo.threads)
 
 

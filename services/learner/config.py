@@ -64,8 +64,11 @@ class PPOConfig(BaseModel):
         ge=0,
         description="weight of the loss that pulls the mean towards hit corrections or a teacher; 0: PPO alone",
     )
-    refit_epochs: int = Field(
-        24, ge=0, le=1000, description="most epochs after a stage change in which only the critic learns"
+    refit_frames: int = Field(
+        200_000,
+        ge=0,
+        description="after a stage change only the critic learns, from so many frames at most",
+        json_schema_extra={"unit": "frames"},
     )
     refit_variance: float = Field(
         0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"

@@ -37,7 +37,8 @@ class GroupError(ReportedError):
 class Links(Protocol):
     """A rank's links to the others. All ranks make the same calls in the same order.
 
-    Every method raises RuntimeError or OSError where another rank does not do its part.
+    Every method raises RuntimeError or OSError where another rank does not do its part. A sum of tensors on a GPU is
+    only begun: there NCCL ends the process instead.
     """
 
     def exchanged(self, own: bytes, on_tick: Callable[[], None] | None = None) -> list[bytes]:

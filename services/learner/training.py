@@ -11,6 +11,7 @@ import torch
 
 from common.comms.messages import Rollout
 from common.env.robot import home_action
+from common.errors import ReportedError
 from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
 from common.policy.folder import Policy
@@ -164,9 +165,9 @@ class Training:
         highest = ppo.learning_rate_max if ppo.schedule == "adaptive" else ppo.learning_rate
         bound = self.stages.learning_rate_bound(before.trained, highest, ppo.learning_rate_min)
         # After a stage change the policy waits for a critic that explains the new rewards.
-        refitted = before.epochs_in_stage - before.refitting_since
+        refitted = (before.epochs_in_stage - before.refitting_since) * batch.frames
         is_refitting = before.refitting and (
-            refitted < self.ppo.refit_epochs and batch.explained < self.ppo.refit_variance
+            refitted < self.ppo.refit_frames and batch.explained < self.ppo.refit_variance
         )
         mode = (
             UpdateMode.CRITIC_ONLY
@@ -307,7 +308,14 @@ def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
 
     Raises:
         PolicyError: The policy that it is to start from does not fit.
+        ReportedError: There is no such device, or the ranks have devices of several kinds, which can't sum together.
     """
+    compute = compute_of(config.ppo, config.device)
+    kinds = {kind.decode() for (kind,) in group.gathered_bytes([compute.device.type.encode()])}
+    if len(kinds) > 1:
+        raise ReportedError(
+            f"a group with learners on {' and '.join(sorted(kinds))}; allowed: one --device for all"
+        )
     training = Training(
         config.ppo,
         config.network,
@@ -318,7 +326,7 @@ def new_training(config: LearnerConfig, group: Group = ALONE) -> Training:
         observation=config.task.observation,
         divergence=config.divergence,
         teacher=config.experience.teacher,
-        compute=compute_of(config.ppo, config.device),
+        compute=compute,
     )
     training.group = group
     training.has_start_policy = bool(config.start_policy)

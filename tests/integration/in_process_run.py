@@ -23,7 +23,7 @@ from services.learner.config import CurriculumConfig, IntakeConfig, LearnerConfi
 from services.learner.service import LearnerService
 
 NETWORK = NetworkConfig(units=(32, 16))
-PPO = PPOConfig(minibatch=128, mini_epochs=2, refit_epochs=1)
+PPO = PPOConfig(minibatch=128, mini_epochs=2, refit_frames=1)
 ENVS, HORIZON = 16, 16
 DATASET = 2 * ENVS * HORIZON  # frames
 CURRICULUM = CurriculumConfig(stage_1=3 * DATASET, stage_2=2 * DATASET, stage_3=3 * DATASET)

@@ -63,7 +63,7 @@ def test_a_run_goes_through_its_stages_and_every_rollout_is_accounted_for(tmp_pa
 
 def test_a_run_with_the_papers_switches_changes_stages_by_frames_and_saves_its_newest_weights(tmp_path):
     curriculum = CurriculumConfig(stage_shares=(0.375, 0.25, 0.375), count_reset="raw")
-    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_epochs": 0})
+    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_frames": 0})
     with local_run(
         tmp_path, curriculum=curriculum, ppo=ppo, frames=8 * DATASET, evaluated_weights="newest"
     ) as s:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 TINY = [
     *("--network.units", "32,16"),
     *("--actor.envs", "32", "--actor.horizon", "16"),
-    *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-epochs", "1"),
+    *("--learner.ppo.minibatch", "256", "--learner.ppo.refit-frames", "1"),
     *("--evaluator.rallies", "20", "--evaluator.envs", "10", "--evaluator.interval-s", "1"),
     *("--final-rallies", "40", "--panel", "off", "--json"),
 ]

@@ -37,7 +37,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
         return tuple(drawing for drawing in drawings if drawing.name.startswith(beginnings))
 
     config = found.settings
-    rounds, differences = tables.rounds(found), tables.differences(found)
+    rounds, differences, robots = tables.rounds(found), tables.differences(found), tables.robots(found)
     parts = [
         Section(
             "",
@@ -57,6 +57,7 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
     ]
     if any(one.played is not None for one in found.groups):
         parts += [
+            Section("What it asked of the robot", tables=(robots,) if robots else ()),
             Section("How rallies ended", tables=(tables.outcomes(found),), drawings=named("outcomes")),
             Section("Where balls land", drawings=named("landings", "courts")),
             Section("Ball after ball", tables=(rounds,) if rounds else (), drawings=named("rounds")),

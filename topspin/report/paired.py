@@ -64,14 +64,19 @@ def comparisons(groups: Sequence[GroupResult]) -> list[Comparison]:
     """Return all differences between experiments that share two or more seeds."""
     found = []
     for one, other in combinations(groups, 2):
-        a, b = (
-            {run.seed: run.measures for run in group.runs if run.played is not None} for group in (one, other)
-        )
-        seeds = sorted(a.keys() & b.keys())
         for measure in COMPARED:
-            pairs = [(a[seed].get(measure), b[seed].get(measure)) for seed in seeds]
-            known = [(x, y) for x, y in pairs if x is not None and y is not None]
-            if len(known) >= 2:
-                first, second = zip(*known, strict=True)
-                found.append(Comparison(one.label, other.label, measure, difference(first, second)))
+            a, b = (by_seed(group, measure) for group in (one, other))
+            seeds = sorted(a.keys() & b.keys())
+            if len(seeds) >= 2:
+                apart = difference([a[seed] for seed in seeds], [b[seed] for seed in seeds])
+                found.append(Comparison(one.label, other.label, measure, apart))
     return found
+
+
+def by_seed(group: GroupResult, measure: str) -> dict[int, float]:
+    """Return one measure of each seed that has it: the mean of the runs of that seed."""
+    values: dict[int, list[float]] = {}
+    for run in group.runs:
+        if run.played is not None and (value := run.measures.get(measure)) is not None:
+            values.setdefault(run.seed, []).append(value)
+    return {seed: float(np.mean(of_seed)) for seed, of_seed in values.items()}

@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from common.evaluation.breakdown import breakdown, survival
 from common.evaluation.match import evaluation_rallies, match_task, play_match
 from common.evaluation.measures import MatchResult, measures
+from common.evaluation.robot_measures import robot_part
 from common.policy.folder import Policy
 from common.task.config import TaskConfig
 from common.task.launch import RallyBlock
@@ -61,6 +63,7 @@ class RunResult:
     played: MatchResult | None  # None: it has no policy to play
     went_on: MatchResult | None  # the same with ROUNDS rallies per episode; None: not played
     measures: Mapping[str, Any]
+    robot: Mapping[str, Any]  # what it asked of the robot; {}: not played
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +132,14 @@ def _of_run(
     defaults: Mapping[str, Any],
     on_tick: Callable[[], None],
 ) -> RunResult:
-    played, went_on, found = None, None, dict[str, Any]()
+    played, went_on, found, robot = None, None, dict[str, Any](), dict[str, Any]()
     if run.policy is not None:
         log.info("playing run=%s policy=%s rallies=%d", run.name, config.policy, config.rallies)
         played = play_match(
             run.policy, rallies, evaluation_task(run.policy, config, config.rounds), config.envs, on_tick
         )
         found = measures(played)
+        robot = robot_part(played.robot, run.policy.contract.task.robot).get("robot", {})
         if config.rounds_too:
             task = evaluation_task(run.policy, config, ROUNDS)
             went_on = play_match(run.policy, rallies, task, config.envs, on_tick)
@@ -150,6 +154,7 @@ def _of_run(
         played=played,
         went_on=went_on,
         measures=found,
+        robot=robot,
     )
 
 
@@ -169,15 +174,25 @@ def _of_group(one: Group, runs: Sequence[RunResult]) -> GroupResult:
 
 
 def inequalities(groups: Sequence[GroupResult]) -> Iterator[str]:
-    """Return in words why runs of one group are not comparable seeds of one experiment."""
+    """Return in words why runs are not comparable seeds of one experiment, or experiments of one length."""
     for one in groups:
         frames = [result.frames for result in one.runs if result.frames]
-        if frames and max(frames) > UNEQUAL * min(frames):
+        if _are_unequal(frames):
             longest, shortest = max(frames) / 1e6, min(frames) / 1e6
             yield f"{one.label}: its runs are of different length, {shortest:.1f} to {longest:.1f} M frames"
         twice = sorted({seed for seed in one.seeds if one.seeds.count(seed) > 1})
         if twice:
             yield f"{one.label}: several runs of seed {', '.join(map(str, twice))}"
+    lengths = {
+        one.label: median(found) for one in groups if (found := [r.frames for r in one.runs if r.frames])
+    }
+    if _are_unequal(list(lengths.values())):
+        each = ", ".join(f"{label} {frames / 1e6:.1f}" for label, frames in lengths.items())
+        yield f"experiments are of different length, in M frames: {each}"
+
+
+def _are_unequal(frames: Sequence[float]) -> bool:
+    return bool(frames) and max(frames) > UNEQUAL * min(frames)
 
 
 def mean_of(policy: Policy | None) -> tuple[str, ...]:
@@ -241,6 +256,7 @@ def _run_json(result: RunResult) -> dict[str, Any]:
         "stage_changes": [list(change) for change in run.training.stage_changes()] if run.training else [],
         "policy": of_policy | {"mean_of": list(mean_of(policy))},
         "measures": dict(result.measures),
+        "robot": dict(result.robot),
         "by": breakdown(result.played) if result.played is not None else {},
         "survival": survival(result.went_on) if result.went_on is not None else {},
         "curve": _curve_json(run.curve) if run.curve is not None else {},

@@ -231,6 +231,35 @@ def outcomes(found: Results) -> Table:
     return Table("How rallies ended", ("outcome", *(one.label for one in groups)), tuple(rows))
 
 
+def robots(found: Results) -> Table | None:
+    """Return what each run's policy asked of its robot, or None if none was played."""
+    rows = []
+    for one in found.groups:
+        for result in one.runs:
+            asked = result.robot
+            if not asked:
+                continue
+            fastest = max(asked["speed_over_limit_by_joint"].items(), key=lambda joint: joint[1])
+            speed = asked["racket_speed_m_per_s"]
+            rows.append(
+                (
+                    result.run.name,
+                    asked["name"],
+                    percent(asked["self_penetration_share"], 2),
+                    percent(asked["table_strike_share"], 2),
+                    f"{asked['speed_over_limit_max']:.2f} ({fastest[0]})",
+                    *(NOTHING if speed[k] is None else f"{speed[k]:.1f} m/s" for k in ("p50", "max")),
+                    percent(asked["rim_hit_share"]),
+                )
+            )
+    columns = (
+        "run", "robot", "in itself > 2 mm", "on the table > 50 N", "joint speed / limit", "racket at contact, median",
+        "largest", "hits on the rim",
+    )  # fmt: skip
+    note = "Shares of rallies; largest joint speed over its limit, and the joint; the rim is beyond 85 % of the radius."
+    return Table("What it asked of the robot", columns, tuple(rows), note=note) if rows else None
+
+
 def by_kind(found: Results) -> list[Table]:
     """Return a table for each breakdown."""
     groups = [one for one in found.groups if one.played is not None]

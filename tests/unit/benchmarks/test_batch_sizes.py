@@ -40,7 +40,8 @@ def test_all_sizes_have_their_first_seed_before_one_has_its_second():
 def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, monkeypatch, capsys):
     stop, asked = Event(), []
 
-    def train(config, name, seed, stopped):
+    def train(config, name, seed, stopped, resumes):
+        assert resumes
         asked.append((name, seed, config.more))
         if len(asked) == 3:
             stopped.set()  # Ctrl-C in the third

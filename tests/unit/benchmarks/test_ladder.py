@@ -34,13 +34,54 @@ def test_each_rung_changes_what_its_flags_name_and_nothing_else(rung):
     assert {change.split()[0] for change in changed} == named
 
 
+def save_run(folder, rung, seed, *more):
+    flags = ("--recipe", RECIPE, *flags_of(rung), "--seed", str(seed), "--frames", "15000000", *more)
+    save_settings(folder.config, to_tables(settings(("--run", "r", *flags), "p"), "local"))
+
+
+@pytest.mark.parametrize(
+    ("rung", "more", "said"),
+    [
+        (5, (), "task.observation.critic privileged"),
+        (3, ("--frames", "2000000"), "frames 2000000"),
+        (3, ("--seed", "2"), "seed 2"),
+        (3, ("--learner.ppo.clip", "0.1"), "learner.ppo.clip 0.1"),
+    ],
+)
+def test_a_run_of_other_settings_is_not_taken_for_a_rung(tmp_path, monkeypatch, rung, more, said):
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder.of("ladder-3-1")
+    folder.create()
+    save_run(folder, rung, 1, *more)
+    folder.final.write_text(json.dumps({"return_rate": 0.5}))
+
+    with pytest.raises(
+        ReportedError, match=f"is not rung 3 of this ladder, but has .*{said}.*; choose another --run"
+    ):
+        main(LadderConfig(train=False), Event())
+
+
+def test_the_number_of_actors_does_not_make_another_rung(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    folder = RunFolder.of("ladder-2-1")
+    folder.create()
+    save_run(folder, 2, 1, "--actors", "2")
+    folder.final.write_text(
+        json.dumps(
+            {"return_rate": 0.5, "return_after_catch": 0.6, "target_error_mean": 0.4, "frames": 15_000_000}
+        )
+    )
+
+    assert main(LadderConfig(train=False), Event()) == 0
+    assert capsys.readouterr().out.startswith("2  return_rate 0.5")
+
+
 def test_measured_runs_are_printed_by_rung(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for rung, seed, rate in ((0, 1, 0.2), (0, 2, 0.4), (3, 1, 0.7)):
         folder = RunFolder.of(f"ladder-{rung}-{seed}")
         folder.create()
-        config = settings(("--run", "r", "--recipe", RECIPE, *flags_of(rung), "--seed", str(seed)), "p")
-        save_settings(folder.config, to_tables(config, "local"))
+        save_run(folder, rung, seed)
         measured = {"return_rate": rate, "return_after_catch": rate, "target_error_mean": 0.5, "frames": 1000}
         folder.final.write_text(json.dumps(measured))
 

@@ -147,3 +147,23 @@ def test_without_a_run_there_is_nothing_to_compare():
 def test_words_without_a_flag_are_runs():
     assert with_runs(["a", "--json", "b"]) == ["--json", "--runs", '["a", "b"]']
     assert with_runs(["--config", "x.toml"]) == ["--config", "x.toml"]
+
+
+def test_a_run_that_was_stopped_is_shown_and_not_in_the_median():
+    header = "frames,return_rate,return_after_catch,target_error_mean"
+    found = rungs(
+        [
+            finished("a", "--recipe", "paper"),
+            finished("b", "--recipe", "paper", final={}, evaluations=f"{header}\n900,0.9,0.9,0.1\n"),
+        ]
+    )
+
+    assert [run["measured"] for run in found["paper"]] == ["final", "last evaluation"]
+    assert found["ladder"][0]["median"]["return_rate"] == 0.5
+
+
+def test_a_run_that_is_given_by_name_and_by_folder_counts_once(capsys):
+    finished("a", "--recipe", "paper")
+    main(RecipeConfig(runs=("a", "runs/a"), json_line=True), Event())
+
+    assert len(json.loads(capsys.readouterr().out)["paper"]) == 1

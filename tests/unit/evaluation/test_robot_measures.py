@@ -48,6 +48,8 @@ def test_a_table_strike_is_a_force_over_50_newton():
 
     assert found["table_strike_share"] == 0.5
     assert found["table_force_n"]["max"] == 200.0
+    assert found["table_force_n_by_link"]["racket"]["p50"] == pytest.approx(50.0)
+    assert found["table_force_n_by_link"]["forearm"] == {"p50": 0.0, "p99": 0.0, "max": 0.0}
 
 
 def test_the_largest_joint_speed_is_that_of_all_rallies_and_by_joint():

@@ -140,7 +140,12 @@ def test_a_rollback_restores_the_network_and_not_the_counts(tmp_path):
 
 
 STAGES = CurriculumConfig(stage_1=2 * ROLLOUT_FRAMES, stage_2=2 * ROLLOUT_FRAMES, stage_3=50 * ROLLOUT_FRAMES)
-HELD = {"refit_epochs": 3, "refit_variance": 1.0, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
+HELD = {
+    "refit_frames": 3 * ROLLOUT_FRAMES,
+    "refit_variance": 1.0,
+    "learning_rate_min": 3e-3,
+    "learning_rate_max": 3e-3,
+}
 
 
 def played_by(training):
@@ -208,7 +213,7 @@ def test_a_critic_that_goes_back_to_the_old_rewards_learns_the_new_ones_first(tm
 
 
 def test_going_back_within_a_stage_leaves_its_critic_and_normaliser_as_they_were(tmp_path):
-    training = make_training(curriculum=STAGES, refit_epochs=1)
+    training = make_training(curriculum=STAGES, refit_frames=1)
     for seed in range(8):
         training.run_epoch([make_rollout(seed)])
     assert not training.progress.refitting

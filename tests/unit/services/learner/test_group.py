@@ -119,7 +119,7 @@ def train_together(size: int, where: dict[str, str], ppo: PPOConfig) -> list[dic
 def test_ranks_reach_the_parameters_of_one_learner(size, minibatch, links, tmp_path):
     """Of four ranks with minibatches of 32 some have no frame in a minibatch, and the others train it."""
     ppo = PPOConfig(
-        minibatch=minibatch, mini_epochs=2, precision="float32", correction_weight=5.0, refit_epochs=1
+        minibatch=minibatch, mini_epochs=2, precision="float32", correction_weight=5.0, refit_frames=1
     )
     where = (
         {"GROUP_FILE": str(tmp_path / "group")}

@@ -14,7 +14,7 @@ from common.task.observation import critic_layout, policy_layout, size
 from services.learner.__main__ import settings, settings_for_others
 from services.learner.config import LearnerConfig
 from services.learner.training import new_training
-from tests.unit.services.learner.rollouts import make_rollout
+from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
 
 NETWORK = NetworkConfig(units=(16, 8))
 FLAGS = (
@@ -87,7 +87,7 @@ def test_while_the_critic_learns_the_moments_change_but_not_what_is_played(saved
 
 
 def test_the_policy_learns_once_the_critic_has(saved):
-    training = started(saved, "--ppo.refit-epochs", "2")
+    training = started(saved, "--ppo.refit-frames", str(2 * ROLLOUT_FRAMES))
     for epoch in range(2):
         training.run_epoch([make_rollout(epoch, obs_size=training.obs_size)])
     mean = training.network.mean.weight.detach().clone()

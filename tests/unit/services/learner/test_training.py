@@ -19,7 +19,7 @@ from services.learner.run_log import RunLog, row
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
 
-PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_epochs=1)
+PPO = PPOConfig(minibatch=64, mini_epochs=2, refit_frames=1)
 DATASET = 2 * ROLLOUT_FRAMES
 CURRICULUM = CurriculumConfig(stage_1=3 * DATASET, stage_2=2 * DATASET, stage_3=50 * DATASET)
 EXTRAS = Extras(run="r", generation=7, stage_log=[], accounts=[], trained_seconds=1.5)
@@ -120,7 +120,7 @@ def test_the_reset_of_the_count_is_absorbed_by_the_network_or_raw(count_reset, p
 
 
 def test_the_schedule_is_constant_and_then_linear_over_the_last_stage():
-    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_epochs": 0, "target_kl": 1e-6})
+    ppo = PPO.model_copy(update={"schedule": "constant_then_linear", "refit_frames": 0, "target_kl": 1e-6})
     curriculum = CurriculumConfig(stage_shares=(0.25, 0.25, 0.5))
     size = 2 * 16 * 8
     training = make_training(ppo=ppo, curriculum=curriculum, frames=8 * size)
@@ -185,9 +185,9 @@ def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
 
     curriculum = CURRICULUM.model_copy(update={"stage_2": 50 * DATASET})
 
-    def moved(refit_epochs):
+    def moved(refit_frames):
         ppo = PPO.model_copy(
-            update={"refit_epochs": refit_epochs, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
+            update={"refit_frames": refit_frames, "learning_rate_min": 3e-3, "learning_rate_max": 3e-3}
         )
         training = Training(
             ppo, NetworkConfig(units=(16, 8)), StageLengths(curriculum), np.zeros(7, np.float32), 0
@@ -201,8 +201,8 @@ def test_the_first_epochs_of_a_new_stage_train_the_critic_only():
         after, value_after = outputs(training)
         return float((after - before).square().mean()), float((value_after - value_before).square().mean())
 
-    held, held_value = moved(refit_epochs=4)
-    free, free_value = moved(refit_epochs=0)
+    held, held_value = moved(refit_frames=4 * DATASET)
+    free, free_value = moved(refit_frames=0)
 
     assert held < 1e-9  # rounding, as the normaliser changes
     assert free > 1e-5

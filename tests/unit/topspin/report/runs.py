@@ -31,4 +31,4 @@ def make_policy(observation):
 
 def make_result(run, rows, seed=0):
     played = make_played(rows)
-    return RunResult(run, seed, "", None, None, played, None, measures(played))
+    return RunResult(run, seed, "", None, None, played, None, measures(played), {})

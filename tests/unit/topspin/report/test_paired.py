@@ -1,6 +1,7 @@
 """Differences between experiments, seed by seed, against Student's t by hand."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -65,6 +66,14 @@ def test_experiments_are_compared_by_the_seeds_that_both_have():
     assert {(one.first, one.second) for one in found.values()} == {("a", "b")}
     assert found["return_rate"].difference.mean == pytest.approx((0.2 + 0.1) / 2)
     assert found["return_rate"].difference.pairs == 2
+
+
+def test_of_several_runs_of_one_seed_the_mean_counts():
+    one, other = make_group("a", {0: 5, 1: 6}), make_group("b", {0: 7, 1: 7})
+    again = replace(other, runs=(*other.runs, *make_group("b", {0: 9}).runs))
+    (found,) = [each for each in comparisons([one, again]) if each.measure == "return_rate"]
+
+    assert found.difference.mean == pytest.approx(((0.8 - 0.5) + (0.7 - 0.6)) / 2)
 
 
 def test_the_table_says_points_metres_and_p():

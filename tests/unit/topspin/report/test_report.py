@@ -268,17 +268,20 @@ def test_policies_are_measured_on_the_reports_task_not_their_training_task(tmp_p
 
 
 def test_runs_of_unequal_length_or_of_one_seed_are_reported():
-    def of(*frames_and_seeds):
+    def of(*frames_and_seeds, label="ours"):
         runs = tuple(
-            RunResult(make_run(), seed, "", frames, None, None, None, {}) for frames, seed in frames_and_seeds
+            RunResult(make_run(), seed, "", frames, None, None, None, {}, {})
+            for frames, seed in frames_and_seeds
         )
-        return GroupResult("ours", "", runs, None, {}, {}, {}, {})
+        return GroupResult(label, "", runs, None, {}, {}, {}, {})
 
     assert not [*inequalities([of((10_000_000, 0), (10_002_432, 1), (None, 2))])]
     assert [*inequalities([of((10_000_000, 0), (60_000_000, 1)), of((5, 3), (5, 3))])] == [
         "ours: its runs are of different length, 10.0 to 60.0 M frames",
         "ours: several runs of seed 3",
     ]
+    longer = of((15_000_000, 0), label="a"), of((120_000_000, 0), label="b")
+    assert [*inequalities(longer)] == ["experiments are of different length, in M frames: a 15.0, b 120.0"]
 
 
 def test_a_mean_of_policies_is_reported_as_one(tmp_path, monkeypatch):
@@ -316,10 +319,15 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     assert one["pooled"]["rallies"] == 48
     assert one["over_seeds"]["catch_rate"]["seeds"] == 2
     assert one["runs"][0]["stage_changes"] == [[2, 2000.0]]
+    asked = one["runs"][1]["robot"]
+    assert asked["name"] == "rails"
+    assert set(asked["table_force_n_by_link"]) == set(asked["self_penetration_by_link"])
     assert found["missing"] == ["b: no epochs in metrics.csv: frames, hours and stages are unknown"]
     page = (tmp_path / "o" / "report.md").read_text()
     assert "| **Topspin, stages 1+2 (2 seeds)** | no |" in page
     assert "- b: no epochs in metrics.csv" in page
+    assert "## What it asked of the robot\n" in page
+    assert re.search(r"\n\| a \| rails \| \d+\.\d\d % \| \d+\.\d\d % \| \d\.\d\d \(\w+\) \|", page)
     assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
     assert "--rounds-too --note note.txt" in page
     assert "topspin train --run b --seed 1" in page
@@ -361,7 +369,8 @@ def test_a_group_is_named_after_the_stages_that_were_trained():
 def test_a_curve_of_one_point_is_drawn_as_a_point(seeds):
     curve = Curve(np.array([1e6]), np.array([2.0]), {name: np.array([0.5]) for name in CURVES})
     runs = tuple(
-        RunResult(replace(make_run(), curve=curve), 0, "", None, None, None, None, {}) for _ in range(seeds)
+        RunResult(replace(make_run(), curve=curve), 0, "", None, None, None, None, {}, {})
+        for _ in range(seeds)
     )
     one = GroupResult("one", "one", runs, None, {}, {}, {}, {})
 
