@@ -4,33 +4,24 @@
 
 Every rung trains with all changes of the rungs below it and one of its own. The first is recipe ``paper-50hz``, the
 last has the default's settings. A rung's worth depends on those below it: another order would give other figures.
-Runs are in runs/NAME-RUNG-SEED. What is trained already is not trained again, so the program goes on where it was
-stopped, and two of it can share the rungs (``--rungs``).
+Runs are runs/NAME-RUNG-SEED. What is trained already is not trained again (``benchmarks.trainings``), so the program
+goes on where it was stopped, and two of it can share the rungs (``--rungs``).
 """
 
 import json
-import signal
-import subprocess
 import sys
-from collections.abc import Sequence
 from threading import Event
 from typing import Any, Final, NamedTuple
 
 from pydantic import Field
 
-from benchmarks.recipe import MEASURES, differences, medians, result
+from benchmarks.recipe import MEASURES, medians, result
 from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.trainings import Wanted, made, make
 from common.errors import ReportedError
-from common.service.config import to_tables
-from common.service.config_sources import read_toml
 from common.service.process import DONE, FAILED
-from common.service.run_folder import RunFolder
-from deploy.config import SECTION
-from deploy.config import settings as load_deploy
-from topspin.report.groups import experiment
 
 RECIPE: Final = "paper-50hz"
-LOOK_S: Final = 1.0
 
 
 class Rung(NamedTuple):
@@ -125,65 +116,20 @@ def flags_of(rung: int) -> list[str]:
     return [part for name, value in together.items() for part in (f"--{name}", value)]
 
 
-def is_measured(folder: RunFolder) -> bool:
-    """Return whether a run has trained to its end: one that was stopped leaves a summary without rates."""
-    return folder.final.is_file() and "return_rate" in json.loads(folder.final.read_text(encoding="utf-8"))
+def wanted(config: LadderConfig, rung: int, seed: int) -> Wanted:
+    """Return the training of a rung with one seed."""
+    flags = ("--recipe", RECIPE, "--seed", str(seed), "--frames", str(config.frames), *flags_of(rung))
+    return Wanted(f"{config.run}-{rung}-{seed}", flags)
 
 
-def new_run(config: LadderConfig, rung: int, seed: int) -> list[str]:
-    """Return the flags that start the training of a rung."""
-    return ["--recipe", RECIPE, "--seed", str(seed), "--frames", str(config.frames), *flags_of(rung)]
-
-
-def check_is_rung(config: LadderConfig, rung: int, seed: int, folder: RunFolder) -> None:
-    """Raise ReportedError if a run is not the training of a rung: its settings, seed or frames are others."""
-    own = read_toml(folder.config)
-    wanted = to_tables(load_deploy(("--run", "rung", *new_run(config, rung, seed)), "ladder"), SECTION)
-    other = differences(experiment(own), experiment(wanted))
-    other += [f"{name} {own.get(name)}" for name in ("seed", "frames") if own.get(name) != wanted.get(name)]
-    if other:
-        raise ReportedError(
-            f"{folder.root} is not rung {rung} of this ladder, but has {', '.join(other)}; choose another --run"
-        )
-
-
-def train(config: LadderConfig, rung: int, seed: int, stop: Event) -> str:
-    """Train one rung with one seed, or go on with it; nothing if its end is measured. Return why it failed, or ""."""
-    name = f"{config.run}-{rung}-{seed}"
-    folder = RunFolder.of(name)
-    is_there = folder.config.is_file()
-    if is_there:
-        check_is_rung(config, rung, seed, folder)
-        if is_measured(folder):
-            return ""
-    flags = ["--resume"] if is_there else new_run(config, rung, seed)
-    command = [sys.executable, "-m", "topspin", "train", "--run", name, "--panel", "off", *flags]
-    print(f"rung {rung}, seed {seed}: {RUNGS[rung].name}", file=sys.stderr, flush=True)
-    with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    ) as training:
-        while training.poll() is None and not stop.is_set():
-            stop.wait(LOOK_S)
-        if training.poll() is None:
-            training.send_signal(signal.SIGINT)  # it saves, and goes on from there next time
-        status = training.wait()
-    if status and not stop.is_set():
-        return f"training {name} ended with {status}: see {folder.logs}"
-    return ""
-
-
-def figures(config: LadderConfig, rungs: Sequence[int]) -> list[dict[str, Any]]:
+def figures(config: LadderConfig) -> list[dict[str, Any]]:
     """Return what the runs of each rung reached; rungs without a measured run are left out."""
     found = []
-    for rung in rungs:
-        runs = []
-        for seed in config.seeds:
-            folder = RunFolder.of(f"{config.run}-{rung}-{seed}")
-            if is_measured(folder):
-                check_is_rung(config, rung, seed, folder)
-                runs.append(result(folder))
+    for rung, one in enumerate(RUNGS):
+        folders = [made(wanted(config, rung, seed)) for seed in config.seeds]
+        runs = [result(folder) for folder in folders if folder]
         if runs:
-            found.append({"rung": rung, "name": RUNGS[rung].name, "runs": runs, "median": medians(runs)})
+            found.append({"rung": rung, "name": one.name, "runs": runs, "median": medians(runs)})
     return found
 
 
@@ -192,13 +138,10 @@ def main(config: LadderConfig, stop: Event) -> int:
     rungs = config.rungs or tuple(range(len(RUNGS)))
     if wrong := [rung for rung in rungs if not 0 <= rung < len(RUNGS)]:
         raise ReportedError(f"no rung {wrong[0]}; allowed: 0 to {len(RUNGS) - 1}")
-    faults = []
-    for rung in rungs if config.train else ():
-        for seed in config.seeds:
-            if not stop.is_set() and (fault := train(config, rung, seed, stop)):
-                print(fault, file=sys.stderr, flush=True)
-                faults.append(fault)
-    found = figures(config, range(len(RUNGS)))
+    # The first seed of all rungs, then the next: what is there after a stop says something about each
+    asked = [wanted(config, rung, seed) for seed in config.seeds for rung in rungs]
+    faults = make(asked, stop) if config.train else []
+    found = figures(config)
     if config.json_line:
         print(json.dumps({"frames": config.frames, "ladder": found}))
         return FAILED if faults else DONE

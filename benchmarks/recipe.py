@@ -1,5 +1,6 @@
 """What finished runs reached, beside the paper's recipe: one rung for each way to train.
 
+    python -m benchmarks.recipe --json                                      # the runs that the repository keeps
     python -m benchmarks.recipe runs/paper-0 runs/paper-1 runs/more-0 --json
 
 It trains nothing. It reads each run's settings and the measure of its last weights (report/final.json; of a run that
@@ -17,6 +18,7 @@ from typing import Any, Final
 from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.trainings import KEPT, differences
 from common.errors import ReportedError
 from common.service.config import load, recipe_names, to_tables
 from common.service.config_sources import read_toml
@@ -28,6 +30,8 @@ from topspin.report.collect import find
 from topspin.report.groups import experiment
 
 BASE: Final = "paper"
+OF_PAPER: Final = ("paper", "paper-50hz")  # recipes of the paper, by their control rate
+KEPT_RUNS: Final = "recipe-*"  # in results/runs
 FINAL: Final = "final"  # of a run that trained to its end
 MEASURES: Final = ("return_rate", "return_after_catch", "target_error_mean")
 
@@ -36,7 +40,9 @@ class RecipeConfig(BenchmarkConfig):
     """Compare finished runs with the paper's recipe."""
 
     runs: tuple[str, ...] = Field(
-        (), description="runs, by name or folder; words without a flag before them are runs too"
+        (),
+        description="runs, by name or folder; words without a flag before them are runs too; empty: those of the "
+        "recipes that benchmarks/results/runs has",
     )
 
 
@@ -76,21 +82,6 @@ def label(settings: Mapping[str, Any], known: Mapping[str, Mapping[str, Any]]) -
     return name or f"{base} with {', '.join(differences(own, theirs))}"
 
 
-def differences(own: Mapping[str, Any], theirs: Mapping[str, Any]) -> list[str]:
-    """Return the settings that differ, with the values of ``own``."""
-    return [
-        f"{path} {_text(own.get(path, 'unset'))}"
-        for path in sorted(own.keys() | theirs.keys())
-        if own.get(path) != theirs.get(path)
-    ]
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value) if value != "" else "empty"
-
-
 def result(folder: RunFolder) -> dict[str, Any]:
     """Return the measures of a finished run's last weights.
 
@@ -125,15 +116,15 @@ def _number(value: Any) -> float | None:
 
 
 def rungs(folders: Sequence[RunFolder]) -> dict[str, Any]:
-    """Return the runs of the recipe, and all runs by label with the median of each measure: the recipe's rung first."""
+    """Return the runs of the paper's recipes, and all runs by label with the medians of the measures: theirs first."""
     known = known_settings()
-    by_label: dict[str, list[dict[str, Any]]] = {BASE: []}
+    by_label: dict[str, list[dict[str, Any]]] = {name: [] for name in OF_PAPER}
     for folder in folders:
         by_label.setdefault(label(read_toml(folder.config), known), []).append(result(folder))
     ladder = [
         {"label": name, "runs": runs, "median": medians(runs)} for name, runs in by_label.items() if runs
     ]
-    return {BASE: by_label[BASE], "ladder": ladder}
+    return {BASE: [{"recipe": name} | run for name in OF_PAPER for run in by_label[name]], "ladder": ladder}
 
 
 def median(runs: Sequence[Mapping[str, Any]], key: str) -> float | None:
@@ -150,11 +141,12 @@ def medians(runs: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
 def main(config: RecipeConfig, stop: Event) -> int:
     """Print the rungs and return the exit status."""
     del stop  # it reads a few files
-    if not config.runs:
+    runs = config.runs or sorted(str(path) for path in KEPT.glob(KEPT_RUNS))
+    if not runs:
         raise ReportedError(
             "no run to compare; give folders, as in: python -m benchmarks.recipe runs/paper-0"
         )
-    folders = {folder.root: folder for folder in map(find, config.runs)}  # each once, under whatever names
+    folders = {folder.root: folder for folder in map(find, runs)}  # each once, under whatever names
     found = rungs(list(folders.values()))
     if config.json_line:
         print(json.dumps(found))

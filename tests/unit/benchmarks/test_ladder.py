@@ -5,13 +5,20 @@ from threading import Event
 
 import pytest
 
-from benchmarks.ladder import RECIPE, RUNGS, LadderConfig, flags_of, is_measured, main
-from benchmarks.recipe import differences, known_settings
+from benchmarks import trainings
+from benchmarks.ladder import RECIPE, RUNGS, LadderConfig, flags_of, main
+from benchmarks.recipe import known_settings
+from benchmarks.trainings import differences, is_measured
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
 from common.service.run_folder import RunFolder
 from deploy.config import settings
 from topspin.report.groups import experiment
+
+
+@pytest.fixture(autouse=True)
+def _nothing_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainings, "KEPT", tmp_path / "kept")
 
 
 def settings_of(rung):
@@ -53,10 +60,10 @@ def test_a_run_of_other_settings_is_not_taken_for_a_rung(tmp_path, monkeypatch, 
     folder = RunFolder.of("ladder-3-1")
     folder.create()
     save_run(folder, rung, 1, *more)
-    folder.final.write_text(json.dumps({"return_rate": 0.5}))
+    folder.final.write_text(json.dumps({"return_rate": 0.5, "rallies": 1000}))
 
     with pytest.raises(
-        ReportedError, match=f"is not rung 3 of this ladder, but has .*{said}.*; choose another --run"
+        ReportedError, match=f"is not the training that is wanted: it has .*{said}.*; choose another --run"
     ):
         main(LadderConfig(train=False), Event())
 
@@ -68,7 +75,13 @@ def test_the_number_of_actors_does_not_make_another_rung(tmp_path, monkeypatch, 
     save_run(folder, 2, 1, "--actors", "2")
     folder.final.write_text(
         json.dumps(
-            {"return_rate": 0.5, "return_after_catch": 0.6, "target_error_mean": 0.4, "frames": 15_000_000}
+            {
+                "return_rate": 0.5,
+                "return_after_catch": 0.6,
+                "target_error_mean": 0.4,
+                "frames": 15_000_000,
+                "rallies": 1000,
+            }
         )
     )
 
@@ -82,7 +95,13 @@ def test_measured_runs_are_printed_by_rung(tmp_path, monkeypatch, capsys):
         folder = RunFolder.of(f"ladder-{rung}-{seed}")
         folder.create()
         save_run(folder, rung, seed)
-        measured = {"return_rate": rate, "return_after_catch": rate, "target_error_mean": 0.5, "frames": 1000}
+        measured = {
+            "return_rate": rate,
+            "return_after_catch": rate,
+            "target_error_mean": 0.5,
+            "frames": 1000,
+            "rallies": 1000,
+        }
         folder.final.write_text(json.dumps(measured))
 
     assert main(LadderConfig(seeds=(1, 2), train=False, json_line=True), Event()) == 0

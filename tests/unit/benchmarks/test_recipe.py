@@ -1,10 +1,14 @@
 """The ladder of finished runs, from small run folders."""
 
 import json
+import shutil
+import tomllib
+from pathlib import Path
 from threading import Event
 
 import pytest
 
+from benchmarks import recipe
 from benchmarks.recipe import RecipeConfig, known_settings, label, main, rungs, with_runs
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
@@ -17,6 +21,7 @@ FINAL = {"return_rate": 0.5, "return_after_catch": 0.6, "target_error_mean": 0.4
 @pytest.fixture(autouse=True)
 def _elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(recipe, "KEPT", tmp_path / "kept")
 
 
 def finished(name, *flags, final=FINAL, evaluations=""):
@@ -58,7 +63,16 @@ def test_runs_of_the_recipe_are_one_rung_whatever_their_seed_and_length():
         ("c", 2, 0.5),
     ]
     assert set(found["paper"][0]) == {
-        *("run", "seed", "frames", "return_rate", "return_after_catch", "target_error_mean", "measured")
+        *(
+            "recipe",
+            "run",
+            "seed",
+            "frames",
+            "return_rate",
+            "return_after_catch",
+            "target_error_mean",
+            "measured",
+        )
     }
     assert [rung["label"] for rung in found["ladder"]] == ["paper"]
     assert found["ladder"][0]["median"] == {
@@ -109,6 +123,7 @@ def test_a_run_that_was_not_measured_at_its_end_has_its_last_evaluation():
     run = rungs([finished("a", "--recipe", "paper", final={"frames": 1000}, evaluations=rows)])["paper"][0]
 
     assert run == {
+        "recipe": "paper",
         "run": "a",
         "seed": 0,
         "frames": 900,
@@ -167,3 +182,23 @@ def test_a_run_that_is_given_by_name_and_by_folder_counts_once(capsys):
     main(RecipeConfig(runs=("a", "runs/a"), json_line=True), Event())
 
     assert len(json.loads(capsys.readouterr().out)["paper"]) == 1
+
+
+def test_without_runs_those_of_the_repository_are_compared(capsys):
+    shutil.copytree(finished("recipe-50hz-1", "--recipe", "paper-50hz").root, recipe.KEPT / "recipe-50hz-1")
+    shutil.copytree(finished("ladder-1-1").root, recipe.KEPT / "ladder-1-1")
+    main(RecipeConfig(json_line=True), Event())
+
+    (only,) = json.loads(capsys.readouterr().out)["paper"]
+    assert (only["recipe"], only["run"], only["return_rate"]) == ("paper-50hz", "recipe-50hz-1", 0.5)
+
+
+def test_the_repositorys_runs_of_the_recipes_are_what_their_names_say():
+    kept = sorted((Path(__file__).parents[3] / "benchmarks" / "results" / "runs").glob("recipe-*"))
+    assert kept
+    known = known_settings()
+    for folder in kept:
+        rate, seed = folder.name.removeprefix("recipe-").split("-")
+        run = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))
+        assert label(run, known) == {"50hz": "paper-50hz", "200hz": "paper"}[rate]
+        assert (run["seed"], run["frames"]) == (int(seed), 60_000_000)

@@ -1,0 +1,115 @@
+"""What the curriculum and the measured bounces are worth: three ways to train that differ in what they name alone.
+
+    python -m benchmarks.ablation --seeds 0,1,2 --json
+
+Hu et al. compare the curriculum with stage 3 alone, and their collision equations with the simulator's own contacts.
+All three arms here are the default method without what acts in stage 3 alone: hit corrections with the way home, the
+bonus for the predicted landing, and the bound of the action noise that corrections need. Stages have the authors'
+shares of the frames. The last weights of each run play the same 2,000 balls, with the measured bounces. Differences
+are taken seed by seed. Trainings are made once (``benchmarks.trainings``), and the program goes on where it was
+stopped.
+"""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from itertools import combinations
+from threading import Event
+from typing import Any, Final
+
+from pydantic import Field
+
+from benchmarks.recipe import MEASURES, medians, result
+from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.trainings import Wanted, made, make
+from common.service.process import DONE, FAILED
+from topspin.report.paired import difference
+
+BASE: Final[dict[str, str]] = {
+    "experience.hit-correction": "false",
+    "learner.ppo.correction-weight": "0",
+    "task.reward.landing-bonus": "0",
+    "learner.curriculum.aiming-log-std": "1",
+    "learner.curriculum.stage-shares": "0.14,0.48,0.38",
+    "final-rallies": "2000",
+}
+"""Flags of all arms."""
+ARMS: Final[dict[str, dict[str, str]]] = {
+    "curriculum": {},
+    "stage 3 alone": {"learner.curriculum.first-stage": "3"},
+    "simulator's contacts": {"task.collision": "original"},
+}
+"""Flags of each arm besides."""
+
+
+class AblationConfig(BenchmarkConfig):
+    """Train with the curriculum, with stage 3 alone, and with the simulator's contacts, and compare seed by seed."""
+
+    frames: int = Field(
+        30_000_000, ge=1, description="of each training", json_schema_extra={"unit": "frames"}
+    )
+    seeds: tuple[int, ...] = Field((0, 1, 2), description="seeds of each arm: 0,1,2")
+    run: str = Field("ablation", min_length=1, description="name of the runs, before -ARM-SEED")
+    more: tuple[str, ...] = Field((), description="more flags of topspin train, the same for all: --actors,2")
+    train: bool = Field(True, description="false: print what is there")
+
+
+def wanted(config: AblationConfig, arm: str, seed: int) -> Wanted:
+    """Return the training of an arm with one seed."""
+    flags = [text for name, value in (BASE | ARMS[arm]).items() for text in (f"--{name}", value)]
+    name = arm.replace("'", "").replace(" ", "-")
+    own = ("--seed", str(seed), "--frames", str(config.frames), *flags, *config.more)
+    return Wanted(f"{config.run}-{name}-{seed}", own)
+
+
+def figures(config: AblationConfig) -> dict[str, list[dict[str, Any]]]:
+    """Return the measures of the runs of each arm that have ended."""
+    return {
+        arm: [result(folder) for seed in config.seeds if (folder := made(wanted(config, arm, seed)))]
+        for arm in ARMS
+    }
+
+
+def differences(arms: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the differences between arms over the seeds that both have, two at least, with interval and p-value."""
+    found = []
+    for one, other in combinations(arms, 2):
+        for measure in MEASURES:
+            a, b = (
+                {run["seed"]: run[measure] for run in arms[arm] if run[measure] is not None}
+                for arm in (one, other)
+            )
+            seeds = sorted(a.keys() & b.keys())
+            if len(seeds) > 1:
+                apart = difference([a[seed] for seed in seeds], [b[seed] for seed in seeds])
+                rounded = {name: round(value, 4) for name, value in asdict(apart).items()}
+                found.append({"first": one, "second": other, "measure": measure, **rounded})
+    return found
+
+
+def main(config: AblationConfig, stop: Event) -> int:
+    """Train what is missing, and print measures and differences."""
+    # The first seed of all arms, then the next: what is there after a stop can be compared
+    asked = [wanted(config, arm, seed) for seed in config.seeds for arm in ARMS]
+    faults = make(asked, stop) if config.train else []
+    arms = figures(config)
+    apart = differences(arms)
+    if config.json_line:
+        measured = {arm: {"runs": runs, "median": medians(runs)} for arm, runs in arms.items()}
+        print(json.dumps({"frames": config.frames, "arms": measured, "differences": apart}))
+        return FAILED if faults else DONE
+    for arm, runs in arms.items():
+        print(arm)
+        for one in runs:
+            print(f"  seed {one['seed']}  " + "  ".join(f"{key} {one[key]}" for key in MEASURES))
+    for one in apart:
+        print(
+            f"{one['second']} minus {one['first']}, {one['measure']}: {one['mean']:+.4f}, 95 % interval "
+            f"{one['low']:+.4f} to {one['high']:+.4f}, p {one['p']:.3f}, {one['pairs']} pairs"
+        )
+    return FAILED if faults else DONE
+
+
+if __name__ == "__main__":
+    sys.exit(run("ablation", AblationConfig, main))
