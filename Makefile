@@ -70,7 +70,9 @@ bench: $(KERNELS)         ## the quick benchmarks
 	$(BIN)/python -m benchmarks.flight_filter --json
 	$(BIN)/python -m benchmarks.actor --json
 	$(BIN)/python -m benchmarks.learner --json
+	$(BIN)/python -m benchmarks.learners --json
 	$(BIN)/python -m benchmarks.system --json
+	$(BIN)/python -m benchmarks.scaling --costs benchmarks/results/scaling_costs.json --json
 
 bench-guard: $(KERNELS)   ## fail where a part is much slower against its limit than recorded
 	$(BIN)/python -m benchmarks.guard
