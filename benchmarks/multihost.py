@@ -1,10 +1,13 @@
 """A run on several hosts: a router and the learner on one, actors on others; hosts are lost and come back.
 
     python -m benchmarks.multihost --json
+    python -m benchmarks.multihost --learners 2 --json    # a group of learners by torchrun, each on a host of its own
 
 Hosts are network namespaces on one machine, with addresses and cables of their own and no common folder. Each service
 is started as the files of `deploy/cluster` start it: by `deploy.topology`, with a settings file of its host. Then the
-cable of the first actor host is cut, the second one loses its power, and the learner is killed. Each comes back. The
+cable of the first actor host is cut, the second one loses its power, and the learner is killed. Each comes back. In a
+group the host of the last learner loses its power, too: torchrun's agents end after a minute, are started again as
+systemd would do it, and all learners go on from the checkpoint. The
 histories of all services are checked afterwards, as by `benchmarks.chaos`.
 """
 
@@ -24,10 +27,11 @@ from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
+import psutil
 import tomli_w
 from pydantic import Field
 
-from benchmarks.chaos.check import NOT_ACCOUNTED, RULES, check, kept_epochs, learner_lives, lines, names
+from benchmarks.chaos.check import NOT_ACCOUNTED, RULES, check, kept_epochs, learners_of, names
 from benchmarks.chaos.tail import Tail
 from benchmarks.hosts import Host, local_network
 from benchmarks.settings import BenchmarkConfig, print_figures, run
@@ -41,10 +45,13 @@ log = logging.getLogger(__name__)
 
 RUN: Final = "multihost"
 PORT: Final = 7447
+MEETING_PORT: Final = 29400  # where torchrun's agents meet
 ROOT: Final = Path(__file__).parents[1]
 MAX_LAG: Final = 2
 START_S: Final = 180.0  # kernels may have to be compiled
 BACK_S: Final = 60.0
+# torchrun counts a dead agent for 15 s. If a group meets within them, the others wait a minute for it, and end
+GROUP_BACK_S: Final = 240.0
 END_S: Final = 30.0
 ENVS: Final = 32
 HORIZON: Final = 16
@@ -58,6 +65,7 @@ class MultihostConfig(BenchmarkConfig):
 
     actor_hosts: int = Field(2, ge=2, le=16, description="hosts with actors")
     actors: int = Field(2, ge=1, le=16, description="actors of each")
+    learners: int = Field(1, ge=1, le=8, description="that train together, each on a host of its own")
     seconds: float = Field(
         20.0, gt=0, description="time of training before each loss", json_schema_extra={"unit": "s"}
     )
@@ -73,14 +81,17 @@ class Site:
     Args:
         folder: With a folder of each host, and the histories.
         hosts: The first has router, learner, evaluator and generator.
-        actors: Of each other host.
+        actors: Of each host of ``actor_hosts``.
+        learners: Those after the first have the next hosts.
     """
 
     folder: Path
     hosts: list[Host]
     actors: int
+    learners: int = 1
     processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
-    _learner: Tail | None = None
+    agents_again: int = 0  # how often an agent of torchrun was started again
+    _learners: list[Tail] = field(default_factory=list)
     _commands: dict[str, tuple[Host, tuple[str, ...]]] = field(default_factory=dict)
 
     @property
@@ -88,10 +99,15 @@ class Site:
         """The folder of the histories."""
         return self.folder / "history"
 
+    @property
+    def actor_hosts(self) -> list[Host]:
+        """The hosts with actors."""
+        return self.hosts[self.learners :]
+
     def build(self) -> None:
         """Write the settings of each host, and start everything."""
         self.history.mkdir()
-        head, *others = self.hosts
+        head, others = self.hosts[0], self.actor_hosts
         settings = {
             "run": RUN,
             "actors": self.actors * len(others),
@@ -113,7 +129,11 @@ class Site:
             work.mkdir()
             (work / "config.toml").write_text(tomli_w.dumps(settings))
         self.start("router", head, ("deploy.router", "--endpoint", f"tcp/0.0.0.0:{PORT}", "--run", RUN))
-        self.start("learner-0", head, self.arguments("learner", 0, "--auto-resume", "--mode", "client"))
+        learner = self.arguments("learner", 0, "--auto-resume", "--mode", "client")
+        for rank, host in enumerate(self.hosts[: self.learners]):
+            self.start(
+                f"learner-{rank}", host, self.in_group(host, learner) if self.learners > 1 else learner
+            )
         for name in ("evaluator", "generator"):
             self.start(f"{name}-0", head, self.arguments(name, 0))
         numbers = iter(range(self.actors * len(others)))
@@ -126,6 +146,24 @@ class Site:
         """Return module and flags of a service."""
         return role(name).arguments(str(number), "config.toml", "0", *more)
 
+    def in_group(self, host: Host, learner: tuple[str, ...]) -> tuple[str, ...]:
+        """Return module and flags of torchrun's agent on a host, which starts its learner again and again."""
+        return (
+            *("torch.distributed.run", "--nnodes", str(self.learners), "--nproc-per-node", "1"),
+            *(
+                "--rdzv-backend",
+                "c10d",
+                "--rdzv-id",
+                RUN,
+                "--max-restarts",
+                "100",
+                "--local-addr",
+                host.address,
+            ),
+            *("--rdzv-endpoint", f"{self.hosts[0].address}:{MEETING_PORT}"),
+            *("--rdzv-conf", f"is_host={int(host is self.hosts[0])}", "-m", "--", *learner),
+        )
+
     def start(self, name: str, host: Host, arguments: tuple[str, ...]) -> None:
         """Start a process on a host; it ends when this one does."""
         self._commands[name] = (host, arguments)
@@ -136,7 +174,8 @@ class Site:
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+                env=os.environ
+                | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "eth0"},
             )
 
     def names_on(self, host: Host) -> list[str]:
@@ -144,10 +183,25 @@ class Site:
         return [name for name, (place, _) in self._commands.items() if place is host]
 
     def kill(self, names: Iterable[str]) -> None:
-        """Let processes end at once, as without power."""
+        """Let processes, and what they have started, end at once, as without power."""
         for name in names:
+            for child in psutil.Process(self.processes[name].pid).children(recursive=True):
+                child.kill()
             self.processes[name].kill()
             self._collect(name, END_S)
+
+    def kill_learner(self) -> None:
+        """Let the learner that leads end at once; torchrun's agent, if it has one, stays."""
+        if self.learners == 1:
+            self.kill(["learner-0"])
+            return
+        for child in psutil.Process(self.processes["learner-0"].pid).children():
+            child.kill()
+
+    def start_learner_again(self) -> None:
+        """Start the learner again, unless torchrun's agent does it."""
+        if self.learners == 1:
+            self.start_again(["learner-0"])
 
     def start_again(self, names: Iterable[str]) -> None:
         """Start processes as before."""
@@ -156,8 +210,9 @@ class Site:
 
     def end(self) -> None:
         """Stop in order: those that play, the learner, the router."""
-        workers = [name for name in self.processes if name not in {"learner-0", "router"}]
-        for group in (workers, ["learner-0"], ["router"]):
+        learners = [f"learner-{rank}" for rank in range(self.learners)]
+        workers = [name for name in self.processes if name not in {*learners, "router"}]
+        for group in (workers, learners, ["router"]):
             for name in group:
                 self.processes[name].terminate()
             for name in group:
@@ -167,22 +222,26 @@ class Site:
         """End whatever is left."""
         for name, process in self.processes.items():
             if process.poll() is None:
-                process.kill()
-                self._collect(name, END_S)
+                self.kill([name])
 
     def check_alive(self) -> None:
-        """Raise ReportedError if a process has ended by itself."""
-        for name, process in self.processes.items():
-            if process.poll() is not None:
+        """Raise ReportedError if a process has ended by itself; torchrun's agents are started again."""
+        for name, process in list(self.processes.items()):
+            if process.poll() is not None and self.learners > 1 and name.startswith("learner-"):
+                log.info("started again name=%s status=%d", name, process.returncode)
+                self.agents_again += 1
+                self.start_again([name])
+            elif process.poll() is not None:
                 raise ReportedError(
                     f"{name} ended with status {process.returncode}: {self.folder / name}.log"
                 )
 
     def epochs(self) -> list[dict[str, Any]]:
-        """Return what the learner's history has of each epoch, of all lives."""
-        if self._learner is None:
-            self._learner = Tail(self.history / "learner-0.jsonl")
-        return [event for event in self._learner.events() if event["event"] == "trained"]
+        """Return what the learners' histories have of each epoch, of all lives."""
+        if not self._learners:
+            self._learners = [Tail(self.history / f"learner-{rank}.jsonl") for rank in range(self.learners)]
+        events = (event for tail in self._learners for event in tail.events())
+        return [event for event in events if event["event"] == "trained"]
 
     def _collect(self, name: str, timeout_s: float) -> None:
         process = self.processes[name]
@@ -219,8 +278,7 @@ def lose_and_regain(
     site: Site, config: MultihostConfig, stop: Event
 ) -> tuple[dict[str, float], Counter[str]]:
     """Lose a link, a host and the learner; return the seconds until all train again, and what was killed how often."""
-    cut, dark = site.hosts[1:3]
-    learner = ["learner-0"]
+    cut, dark = site.actor_hosts[:2]
     everybody = [name for name in site.processes if name.startswith("actor-")]
     losses: tuple[tuple[str, list[str], Callable[[], None], Callable[[], None]], ...] = (
         ("cable", site.names_on(cut), lambda: cut.set_cable(False), lambda: cut.set_cable(True)),
@@ -230,9 +288,14 @@ def lose_and_regain(
             lambda: site.kill(site.names_on(dark)),
             lambda: site.start_again(site.names_on(dark)),
         ),
-        ("learner", everybody, lambda: site.kill(learner), lambda: site.start_again(learner)),
+        ("learner", everybody, site.kill_learner, site.start_learner_again),
     )
-    killed = Counter([*site.names_on(dark), *learner])
+    killed = Counter([*site.names_on(dark), "learner"])
+    if site.learners > 1:
+        last = site.hosts[site.learners - 1]
+        names = site.names_on(last)
+        losses += (("learner's host", everybody, lambda: site.kill(names), lambda: site.start_again(names)),)
+        killed["learner"] += 1
     back = {}
     for name, actors, lose, regain in losses:
         wait(site, stop, config.seconds)
@@ -243,7 +306,8 @@ def lose_and_regain(
         regain()
         since = time.monotonic()
         trains = partial(all_train, site, actors, since)
-        wait_for(site, stop, trains, BACK_S, f"{', '.join(actors)} to train again")
+        patience_s = BACK_S if site.learners == 1 else GROUP_BACK_S
+        wait_for(site, stop, trains, patience_s, f"{', '.join(actors)} to train again")
         back[name] = round(time.monotonic() - since, 2)
         log.info("back what=%s after_s=%.2f", name, back[name])
     wait(site, stop, config.seconds)
@@ -255,25 +319,27 @@ def figures(site: Site, back: dict[str, float], killed: Counter[str], seconds: f
     ended = {
         name.removeprefix("actor-"): count for name, count in killed.items() if name.startswith("actor-")
     }
-    result = check(site.history, MAX_LAG, ended, killed["learner-0"])
+    result = check(site.history, MAX_LAG, ended, killed["learner"])
     for violation in result.violations:
         log.error("%s: %s (%s)", violation.rule, violation.text, RULES[violation.rule])
-    epochs = kept_epochs(learner_lives(lines(site.history / "learner-0.jsonl")))
+    epochs = kept_epochs(learners_of(site.history))
     rollouts = Counter(name[0] for epoch in epochs for name in names(epoch["rollouts"]))
     frames = sum(rollouts.values()) * ENVS * HORIZON
     by_host = {
         host.address: sum(rollouts[name.removeprefix("actor-")] for name in site.names_on(host))
-        for host in site.hosts[1:]
+        for host in site.actor_hosts
     }
     return {
         "hosts": len(site.hosts),
-        "actors": len(site.hosts[1:]) * site.actors,
+        "learners": site.learners,
+        "actors": len(site.actor_hosts) * site.actors,
         "frames": frames,
         "frames_per_s": round(frames / seconds),
         "rollouts_trained_by_host": by_host,
         "unaccounted": result.count_of(*NOT_ACCOUNTED),
         "trained_twice": result.count_of("trained_twice"),
         "violations": len(result.violations),
+        "agents_started_again": site.agents_again,
         "back_s": back,
         **result.counts,
     }
@@ -285,8 +351,10 @@ def main(config: MultihostConfig, stop: Event) -> int:
     folder = Path(tempfile.mkdtemp(prefix="topspin-multihost-"))
     is_well = False
     with ExitStack() as stack:
-        hosts = stack.enter_context(local_network(["head", *(f"host{n}" for n in range(config.actor_hosts))]))
-        site = Site(folder, hosts, config.actors)
+        learner_hosts = [f"learner{rank}" for rank in range(1, config.learners)]
+        actor_hosts = [f"host{number}" for number in range(config.actor_hosts)]
+        hosts = stack.enter_context(local_network(["head", *learner_hosts, *actor_hosts]))
+        site = Site(folder, hosts, config.actors, config.learners)
         stack.callback(site.tear_down)
         site.build()
         everybody = [name for name in site.processes if name.startswith("actor-")]

@@ -104,14 +104,18 @@ def check(folder: Path, max_lag: int, ended_actors: Mapping[str, int], ended_lea
     """Return what the histories in a folder say.
 
     Args:
-        folder: With NAME.jsonl of every actor and of the learner.
+        folder: With NAME.jsonl of every actor and of every learner.
         max_lag: Versions that a trained rollout may be old.
         ended_actors: How often the schedule ended each actor.
-        ended_learners: How often it ended the learner.
+        ended_learners: How often it ended the learner, or one of the learners that train together.
     """
     actors = [life for file in sorted(folder.glob("actor-*.jsonl")) for life in actor_lives(lines(file))]
-    learners = learner_lives(lines(folder / "learner-0.jsonl"))
-    return judge(actors, learners, max_lag, ended_actors, ended_learners)
+    return judge(actors, learners_of(folder), max_lag, ended_actors, ended_learners)
+
+
+def learners_of(folder: Path) -> list[LearnerLife]:
+    """Return the learner's lives; those of a group are one learner's."""
+    return group_lives([learner_lives(lines(file)) for file in sorted(folder.glob("learner-*.jsonl"))])
 
 
 def lines(file: Path) -> Iterator[Event]:
@@ -167,6 +171,47 @@ def learner_lives(events: Iterable[Event]) -> list[LearnerLife]:
         elif kind == "end":
             life.end = event
     return lives
+
+
+def group_lives(ranks: Sequence[Sequence[LearnerLife]]) -> list[LearnerLife]:
+    """Return the lives of a group of learners, by generation: what its ranks wrote, taken as one learner's.
+
+    Args:
+        ranks: The lives of each rank; the first one leads.
+    """
+    if len(ranks) < 2:
+        return [life for lives in ranks for life in lives]
+    by_generation: dict[int, list[LearnerLife]] = {}
+    for lives in ranks:
+        for life in lives:
+            by_generation.setdefault(life.generation, []).append(life)
+    return [_together(by_generation[life.generation], len(ranks)) for life in ranks[0]]
+
+
+def _together(parts: Sequence[LearnerLife], ranks: int) -> LearnerLife:
+    """Return one life of a group from the parts of its ranks; it has ended in order if all of them have."""
+    epochs: dict[int, dict[str, Any]] = {}
+    for part in parts:
+        for epoch in part.epochs:
+            whole = epochs.setdefault(epoch["version"], {**epoch, "rollouts": [], "lost": []})
+            for key in ("rollouts", "lost"):
+                whole[key] = [*whole[key], *epoch[key]]
+    leader = parts[0]
+    saved = [dict(event) for event in leader.saved]
+    for part in parts[1:]:
+        for event in part.saved[-1:] if saved else ():
+            saved[-1]["waiting"] = [*saved[-1]["waiting"], *event["waiting"]]
+    ends = [part.end for part in parts if part.end is not None]
+    are_whole = len(ends) == ranks
+    sums = {key: sum(end[key] for end in ends) for key in ("trained", "balance")} if are_whole else {}
+    return LearnerLife(
+        start=leader.start,
+        accepted=set[Name]().union(*(part.accepted for part in parts)),
+        given=set[tuple[Name, str]]().union(*(part.given for part in parts)),
+        epochs=[epochs[version] for version in sorted(epochs)],
+        saved=list(saved),
+        end={**ends[0], **sums} if are_whole else None,
+    )
 
 
 def judge(

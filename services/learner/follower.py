@@ -77,6 +77,9 @@ class FollowerService:
             while not self._has_ended:
                 self.step(stop.is_set())
             self._give_accounts(is_last=True)
+            self._history.note(
+                "saved", **where(self.training, self._generation), waiting=lives(self._intake.waiting)
+            )
             self._member.state = "done"
         finally:
             self._beat()

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from benchmarks.chaos.check import RULES, actor_lives, check, judge, learner_lives
+from benchmarks.chaos.check import RULES, actor_lives, check, group_lives, judge, learner_lives
 from benchmarks.chaos.schedule import KINDS, schedule
 
 
@@ -229,3 +229,38 @@ def test_a_schedule_is_a_function_of_its_seed_and_has_every_kind_before_any_come
     for cycle in (faults[: len(KINDS)], faults[len(KINDS) :]):
         assert {fault.kind for fault in cycle} == set(KINDS)
     assert all(fault.kind.seconds[0] <= fault.seconds <= fault.kind.seconds[1] for fault in faults)
+
+
+def of_rank(rank, generation, *events):
+    """Return the events of one rank's life; actor "a" belongs to rank 0, "b" to rank 1."""
+    place = started(generation, 0)
+    return [place, *events, ended(len([event for event in events if event["event"] == "trained"]))]
+
+
+def test_the_ranks_of_a_group_are_one_learner():
+    own, other = ("a", 7, 0), ("b", 8, 0)
+    late = ("b", 8, 1)
+    ranks = [
+        learner_lives(of_rank(0, 5, gave(own), trained(1, [own]), saved(1))),
+        learner_lives(of_rank(1, 5, gave(other), trained(1, [other]), gave(late), saved(1, [late]))),
+    ]
+    (life,) = group_lives(ranks)
+
+    assert life.accepted == {own, other, late}
+    assert [(epoch["version"], epoch["rollouts"]) for epoch in life.epochs] == [(1, [list(own), list(other)])]
+    assert life.saved[-1]["waiting"] == [list(late)]
+    assert (life.end["trained"], life.end["balance"]) == (2, 0)
+
+
+def test_a_group_one_of_whose_ranks_was_killed_has_not_ended_in_order():
+    whole, killed = of_rank(0, 5, trained(1, [name(0)])), of_rank(1, 5, trained(1, [name(1)]))[:-1]
+    again = [of_rank(rank, 6) for rank in (0, 1)]
+    lives = group_lives([learner_lives([*whole, *again[0]]), learner_lives([*killed, *again[1]])])
+
+    assert [(life.generation, life.end is None) for life in lives] == [(5, True), (6, False)]
+
+
+def test_a_learner_alone_is_no_group():
+    lives = learner_lives(LEARNER)
+
+    assert group_lives([lives]) == lives
