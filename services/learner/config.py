@@ -237,8 +237,8 @@ class LearnerOptions(BaseModel):
     intake: IntakeConfig = IntakeConfig()
     evaluated_weights: EvaluatedWeights = Field(
         "mean",
-        description="which weights are evaluated and saved as a policy: mean: their running mean over the last "
-        "tenth of the training, at most 100 datasets; newest: those of the last update, which actors play",
+        description="which weights are evaluated and saved as a policy: mean: their running mean, over the "
+        "last datasets, few in a young training and at most 100; newest: those of the last update, which actors play",
     )
     checkpoint_interval_s: float = Field(
         60.0, gt=0, description="time between checkpoints", json_schema_extra={"unit": "s"}

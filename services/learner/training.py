@@ -39,9 +39,9 @@ from services.learner.start_policy import start_policy
 Floats = npt.NDArray[np.float32]
 
 AVERAGE_DATASETS: Final = 100  # most datasets that the weights' running mean covers: 0.8 M frames
-# [-] share of the training so far that it covers before that. A longer mean of young weights, which learn fast, plays
-# worse than they do.
-AVERAGE_SHARE: Final = 0.1
+# Before that it covers 1 + (age/120)^2 datasets: 2 after 1 M frames, 100 after 10 M. A longer mean of young weights,
+# which learn fast, plays worse than they do (ADR-0012).
+AVERAGE_AGE: Final = 120
 
 
 class Training:
@@ -259,7 +259,7 @@ class Training:
     def _update_ema(self) -> None:
         """Update the running mean of the weights."""
         age = self.progress.version + 1
-        weight = 1.0 / min(1.0 + AVERAGE_SHARE * age, AVERAGE_DATASETS)
+        weight = 1.0 / min(1.0 + (age / AVERAGE_AGE) ** 2, AVERAGE_DATASETS)
         torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
 
     def _enter(self, stage: int) -> None:

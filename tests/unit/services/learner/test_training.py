@@ -141,13 +141,13 @@ def test_the_evaluated_weights_are_the_mean_or_the_newest():
     assert training.weights("newest") is training.network
 
 
-def test_the_mean_of_young_weights_covers_a_tenth_of_the_training():
+def test_the_mean_of_young_weights_covers_few_datasets():
     """A mean over 100 datasets from the start on was half as good as the newest weights after 350."""
     training = make_training(curriculum=CURRICULUM.model_copy(update={"stage_1": 100 * DATASET}))
     expected = training.average.mean.weight.detach().double().clone()
     for epoch in range(30):
         training.run_epoch(dataset(epoch % 3))
-        expected += (training.network.mean.weight.detach() - expected) / (1.0 + (epoch + 1) / 10.0)
+        expected += (training.network.mean.weight.detach() - expected) / (1.0 + ((epoch + 1) / 120.0) ** 2)
 
     torch.testing.assert_close(training.average.mean.weight.double(), expected, rtol=1e-4, atol=1e-6)
 
