@@ -13,6 +13,19 @@ from tests.integration.in_process_run import DATASET, LONG, local_run, progress
 from tests.waiting import wait_until
 
 
+def diverge_in_the_next_epoch(training):
+    """Spoil the parameters within an epoch: between two of them the broken policy would be published, and refused."""
+    train = training.run_epoch
+
+    def run_epoch(*arguments):
+        training.run_epoch = train
+        with torch.no_grad():
+            training.network.mean.weight[:] = float("nan")
+        return train(*arguments)
+
+    training.run_epoch = run_epoch
+
+
 def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it(tmp_path):
     with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=0.2) as s:
         learner = s.learner()
@@ -20,8 +33,7 @@ def test_a_run_that_diverges_goes_back_to_its_last_good_checkpoint_and_counts_it
         s.actor(0, shards=1)
         good = tmp_path / "checkpoints" / "good"
         wait_until(lambda: good.exists() and any(good.iterdir()), 60, "a good checkpoint")
-        with torch.no_grad():
-            learner.service.training.network.mean.weight[:] = float("nan")
+        diverge_in_the_next_epoch(learner.service.training)
         wait_until(lambda: learner.metric("topspin_rollbacks_total") == 1, 30, "a rollback")
         version = progress(learner).version
         wait_until(lambda: progress(learner).version > version + 2, 30, "epochs after it")
@@ -52,8 +64,7 @@ def test_a_run_that_diverges_without_a_good_checkpoint_ends_with_one_line(tmp_pa
         wait_until(policy.exists, 60, "a checkpoint")
         wait_until(lambda n=progress(learner).epoch: progress(learner).epoch > n, 30, "an epoch after it")
         shutil.rmtree(tmp_path / "checkpoints" / "good", ignore_errors=True)
-        with torch.no_grad():
-            learner.service.training.network.mean.weight[:] = float("nan")
+        diverge_in_the_next_epoch(learner.service.training)
         with pytest.raises(DivergedError, match="no good checkpoint to go back to"):
             learner.join(30)
         newest = checkpoints(tmp_path / "checkpoints")[-1]

@@ -39,7 +39,8 @@ def test_a_run_is_watched(tmp_path):
     assert sorted(row.split()[0] for row in rows) == sorted(names)
     assert all("frames_total" in row for row in rows if "learner" in row or "actor" in row)
     assert all("ready" in row for row in rows)
-    assert example(tmp_path, "watch_run.py", "r").returncode == 1  # it was killed
+    # It was killed, and its services end when they notice it
+    wait_until(lambda: example(tmp_path, "watch_run.py", "r").returncode == 1, 60, "all services to be gone")
 
 
 def test_the_papers_recipe_is_trained_measured_and_compared(tmp_path):
