@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 LOCK := $(BIN)/uv pip compile pyproject.toml requirements/beside.in --override requirements/without-torch.txt --upgrade \
 	--no-emit-package torch --universal --python-version 3.11 --generate-hashes --no-header --quiet
-# of the tests: the cores that this process may use, at most four
-WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 4 ? 4 : n)))
+# of the tests: one more than the cores that this process may use, since many tests wait; at most four
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 3 ? 4 : n + 1)))
 STAMP := $(VENV)/.installed
 KERNELS := $(VENV)/.compiled
 MINUTES ?=
