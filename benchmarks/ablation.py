@@ -24,7 +24,7 @@ from benchmarks.recipe import MEASURES, medians, result
 from benchmarks.settings import BenchmarkConfig, run
 from benchmarks.trainings import Wanted, made, make
 from common.service.process import DONE, FAILED
-from topspin.report.paired import difference
+from topspin.report.paired import over_seeds
 
 BASE: Final[dict[str, str]] = {
     "experience.hit-correction": "false",
@@ -80,9 +80,8 @@ def differences(arms: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[st
                 {run["seed"]: run[measure] for run in arms[arm] if run[measure] is not None}
                 for arm in (one, other)
             )
-            seeds = sorted(a.keys() & b.keys())
-            if len(seeds) > 1:
-                apart = difference([a[seed] for seed in seeds], [b[seed] for seed in seeds])
+            apart = over_seeds(a, b)
+            if apart is not None:
                 rounded = {name: round(value, 4) for name, value in asdict(apart).items()}
                 found.append({"first": one, "second": other, "measure": measure, **rounded})
     return found

@@ -5,7 +5,7 @@ and the spread of these differences says how sure their mean is. With three seed
 standard deviation of the differences to each side.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
@@ -60,15 +60,19 @@ def difference(a: Sequence[float], b: Sequence[float]) -> Difference:
     )
 
 
+def over_seeds(a: Mapping[int, float], b: Mapping[int, float]) -> Difference | None:
+    """Return the mean of b - a over the seeds that both have, or None if these are fewer than two."""
+    seeds = sorted(a.keys() & b.keys())
+    return difference([a[seed] for seed in seeds], [b[seed] for seed in seeds]) if len(seeds) > 1 else None
+
+
 def comparisons(groups: Sequence[GroupResult]) -> list[Comparison]:
     """Return all differences between experiments that share two or more seeds."""
     found = []
     for one, other in combinations(groups, 2):
         for measure in COMPARED:
-            a, b = (by_seed(group, measure) for group in (one, other))
-            seeds = sorted(a.keys() & b.keys())
-            if len(seeds) >= 2:
-                apart = difference([a[seed] for seed in seeds], [b[seed] for seed in seeds])
+            apart = over_seeds(*(by_seed(group, measure) for group in (one, other)))
+            if apart is not None:
                 found.append(Comparison(one.label, other.label, measure, apart))
     return found
 
