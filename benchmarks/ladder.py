@@ -38,9 +38,11 @@ RUNGS: Final = (
         {"learner.curriculum.count-reset": "absorbed", "learner.evaluated-weights": "mean"},
     ),
     Rung(
-        "small first noise; smaller datasets, larger minibatches, fewer passes; the learning rate follows the KL",
+        "small noise of the actions at the start: log -1.6 in place of 0", {"network.initial-log-std": "-1.6"}
+    ),
+    Rung(
+        "smaller datasets, larger minibatches, fewer passes; the learning rate follows the KL",
         {
-            "network.initial-log-std": "-1.6",
             "actor.horizon": "32",
             "actor.envs": "0",
             "learner.ppo.mini-epochs": "4",

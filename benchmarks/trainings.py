@@ -23,6 +23,10 @@ from topspin.report.groups import experiment
 
 KEPT: Final = Path(__file__).parent / "results" / "runs"
 LOOK_S: Final = 1.0
+CURVE: Final = (
+    "--evaluator.interval-s",
+    "120",
+)  # enough points for a curve; more often costs up to 7 % of the frames
 BY_NAME: Final = ("seed", "frames")  # settings that make no other experiment, but other figures
 
 
@@ -105,7 +109,7 @@ def _train(wanted: Wanted, stop: Event) -> str:
         is_there = folder.config.is_file()
         if is_there:
             check(wanted, folder)
-        flags = ["--resume"] if is_there else wanted.flags
+        flags = ["--resume"] if is_there else [*CURVE, *wanted.flags]
         print(f"training {wanted.name}: {' '.join(wanted.flags)}", file=sys.stderr, flush=True)
         command = [sys.executable, "-m", "topspin", "train", "--run", wanted.name, "--panel", "off", *flags]
         with subprocess.Popen(

@@ -49,7 +49,7 @@ def save_run(folder, rung, seed, *more):
 @pytest.mark.parametrize(
     ("rung", "more", "said"),
     [
-        (5, (), "task.observation.critic privileged"),
+        (6, (), "task.observation.critic privileged"),
         (3, ("--frames", "2000000"), "frames 2000000"),
         (3, ("--seed", "2"), "seed 2"),
         (3, ("--learner.ppo.clip", "0.1"), "learner.ppo.clip 0.1"),
@@ -70,9 +70,9 @@ def test_a_run_of_other_settings_is_not_taken_for_a_rung(tmp_path, monkeypatch, 
 
 def test_the_number_of_actors_does_not_make_another_rung(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    folder = RunFolder.of("ladder-2-1")
+    folder = RunFolder.of("ladder-3-1")
     folder.create()
-    save_run(folder, 2, 1, "--actors", "2")
+    save_run(folder, 3, 1, "--actors", "2")
     folder.final.write_text(
         json.dumps(
             {
@@ -86,7 +86,7 @@ def test_the_number_of_actors_does_not_make_another_rung(tmp_path, monkeypatch, 
     )
 
     assert main(LadderConfig(train=False), Event()) == 0
-    assert capsys.readouterr().out.startswith("2  return_rate 0.5")
+    assert capsys.readouterr().out.startswith("3  return_rate 0.5")
 
 
 def test_measured_runs_are_printed_by_rung(tmp_path, monkeypatch, capsys):
@@ -125,5 +125,5 @@ def test_a_training_that_was_stopped_is_not_measured(tmp_path):
 
 
 def test_a_rung_that_is_not_there_is_refused():
-    with pytest.raises(ReportedError, match=f"^no rung 9; allowed: 0 to {len(RUNGS) - 1}$"):
-        main(LadderConfig(rungs=(9,)), Event())
+    with pytest.raises(ReportedError, match=f"^no rung {len(RUNGS)}; allowed: 0 to {len(RUNGS) - 1}$"):
+        main(LadderConfig(rungs=(len(RUNGS),)), Event())
