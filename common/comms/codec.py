@@ -160,7 +160,10 @@ def _pack_array(value: Any, wire: Wire, path: str, dims: Dims) -> list[Any]:
         raise EncodeError(f"{path}: {got}; allowed: array of {np.dtype(wire.dtype)}")
     if fault := dims.fault(value.shape, wire.dims, path):
         raise EncodeError(f"{path}: {fault}")
-    return [wire.dtype, list(value.shape), value.tobytes()]
+    if not wire.sent:
+        return [wire.dtype, list(value.shape), value.tobytes()]
+    with np.errstate(over="ignore"):  # it becomes infinite, which the receiver refuses like any other
+        return [wire.sent, list(value.shape), value.astype(wire.sent).tobytes()]
 
 
 # ---- decoding
@@ -252,20 +255,24 @@ def _read_array(raw: Any, wire: Wire, path: str, dims: Dims) -> Any:
     if not (isinstance(raw, list) and len(raw) == 3):
         raise DecodeError(f"{path}: {_short(raw)}; allowed: an array as [dtype, shape, bytes]")
     dtype, shape, content = raw
-    if dtype != wire.dtype:
-        raise DecodeError(f"{path}: dtype {_short(dtype)}; allowed: {wire.dtype!r}")
+    sent = wire.sent or wire.dtype
+    if dtype != sent:
+        raise DecodeError(f"{path}: dtype {_short(dtype)}; allowed: {sent!r}")
     if not isinstance(shape, list) or not all(type(length) is int and length >= 0 for length in shape):
         raise DecodeError(f"{path}: shape {_short(shape)}; allowed: [{', '.join(wire.dims.split())}]")
     if fault := dims.fault(tuple(shape), wire.dims, path):
         raise DecodeError(f"{path}: {fault}")
-    size = math.prod(shape) * np.dtype(wire.dtype).itemsize
+    size = math.prod(shape) * np.dtype(sent).itemsize
     if type(content) is not bytes or len(content) != size:
         got = f"{len(content)} bytes" if type(content) is bytes else _short(content)
         raise DecodeError(f"{path}: {got}; allowed: {size} bytes for shape {tuple(shape)}")
     if wire.dtype == "|b1":
         _check_values(np.frombuffer(content, np.uint8).reshape(shape), Wire(low=0, high=1), path)
     # frombuffer on bytes gives a read-only array and makes no copy
-    array = np.frombuffer(content, dtype=np.dtype(wire.dtype)).reshape(shape)
+    array = np.frombuffer(content, dtype=np.dtype(sent)).reshape(shape)
+    if wire.sent:
+        array = array.astype(wire.dtype)
+        array.flags.writeable = False
     if wire.dtype != "|b1":
         _check_values(array, wire, path)
     return array

@@ -74,7 +74,7 @@ the newest weights."""
 class PolicySnapshot:
     """One version of the policy, with all that an actor needs to play it."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     run: Id
     generation: Count
@@ -85,7 +85,7 @@ class PolicySnapshot:
     frames: Count
     contract_hash: Hash  # of task and network
     training_hash: Hash  # of task, network and experience
-    weights: bytes  # safetensors
+    weights: bytes  # safetensors; matrices in bfloat16 where the learner computes with it (ADR-0067)
     obs_mean: Annotated[F64, Wire("as the observation", "<f8", "D")]
     obs_var: Annotated[F64, Wire("its square", "<f8", "D", low=0)]
     obs_count: Count
@@ -142,7 +142,7 @@ class Episodes:
 class Rollout:
     """One contiguous block of T control steps in B environments, as played."""
 
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
 
     run: Id
     generation: Count
@@ -152,24 +152,25 @@ class Rollout:
     incarnation: Count
     sequence: Sequence  # from 0 without a gap
     training_hash: Hash  # of the actor's task, network and experience
-    obs: Annotated[F32, Wire("as the observation", "<f4", "T B D")]  # raw: the learner normalises
+    # Raw: the learner normalises. Observations and corrections travel as float16 (ADR-0067)
+    obs: Annotated[F32, Wire("as the observation", "<f4", "T B D", sent="<f2")]
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
     log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log density of the action under the policy that acted
     rewards: Annotated[F32, Wire("reward", "<f4", "T B")]
     terminated: Annotated[Bool, Wire("", "|b1", "T B")]
     truncated: Annotated[Bool, Wire("", "|b1", "T B")]
     final_obs: Annotated[
-        F32, Wire("as the observation", "<f4", "K D")
+        F32, Wire("as the observation", "<f4", "K D", sent="<f2")
     ]  # last observation of each truncated episode
     final_index: Annotated[I32, Wire("t * B + b", "<i4", "K", low=0)]  # the step that it follows, increasing
     last_obs: Annotated[
-        F32, Wire("as the observation", "<f4", "B D")
+        F32, Wire("as the observation", "<f4", "B D", sent="<f2")
     ]  # after step T: bootstrap at the block's end
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
     # Target change of the actions before a hit (hit_correction.correction), or difference to the teacher's actions. A
     # row of zeros: no correction
-    corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7")]
+    corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7", sent="<f2")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 
     def fault(self) -> str:

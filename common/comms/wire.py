@@ -26,6 +26,7 @@ class Wire:
         high: Greatest value allowed.
         nan: Whether NaN is allowed. Infinity never is.
         text: Pattern of a text; "": any printable one of up to `budgets.LONGEST_TEXT` characters.
+        sent: dtype of an array in the message, where it is narrower than ``dtype``; "": the same.
     """
 
     unit: str = ""
@@ -35,6 +36,7 @@ class Wire:
     high: float = math.inf
     nan: bool = False
     text: str = ""
+    sent: str = ""
 
 
 @dataclass(frozen=True, slots=True)

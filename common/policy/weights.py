@@ -7,13 +7,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
-from safetensors.numpy import save as save_tensors
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
 
 from common.comms.messages import PolicySnapshot
 from common.policy.actor_critic import ActorCritic
 from common.policy.config import NetworkConfig
 from common.policy.contract import PolicyError
+from common.policy.network_pass import DTYPES, Precision
 from common.policy.normalizer import Moments
 from common.task.observation import (
     ACTION_SIZE,
@@ -42,18 +43,27 @@ def state_tensors(network: ActorCritic) -> dict[str, npt.NDArray[np.float32]]:
     return {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
 
 
-def pack(network: ActorCritic) -> bytes:
-    """Return the network's parameters as a safetensors blob."""
-    return save_tensors(state_tensors(network))
+def pack(network: ActorCritic, precision: Precision = "float32") -> bytes:
+    """Return the network's parameters as a safetensors blob, matrices in ``precision``."""
+    return save_tensors(
+        {
+            name: value.detach().to(DTYPES[precision]) if value.ndim > 1 else value.detach()
+            for name, value in network.state_dict().items()
+        }
+    )
 
 
 def unpack(network: ActorCritic, blob: bytes) -> None:
     """Load a blob of ``pack`` into ``network``; raises PolicyError where it doesn't fit."""
     try:
         tensors = load_tensors(blob)
-    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a dtype that numpy lacks
+    except (SafetensorError, ValueError, KeyError) as error:  # KeyError: a dtype that PyTorch lacks
         raise PolicyError(f"weights are not readable as safetensors: {error}") from None
-    load_state(network, tensors)
+    arrays = {
+        name: (value.float() if value.dtype == torch.bfloat16 else value).numpy()  # which numpy lacks
+        for name, value in tensors.items()
+    }
+    load_state(network, arrays)
 
 
 def load_state(network: ActorCritic, tensors: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -10,6 +10,7 @@ from common.comms.keys import Keys
 from common.comms.messages import AVERAGE, PolicySnapshot, StageChange, StageLog
 from common.comms.transport import Flow, Transport
 from common.policy.actor_critic import ActorCritic
+from common.policy.network_pass import Precision
 from common.policy.weights import pack
 from services.learner.config import EvaluatedWeights
 from services.learner.training import Training
@@ -55,16 +56,18 @@ class Broadcast:
         self._evaluated: EvaluatedWeights = evaluated
         self._transport, self._keys, self._training, self._identity = transport, keys, training, identity
         self.stages = list(stages)
-        self._blob = self._average = b""
+        self._blob = self._to_evaluate = b""
         self._policies = transport.serve(keys.policy(), capacity=MAILBOX)
         self._stage_log = transport.serve(keys.stage(), capacity=MAILBOX)
         if not self.stages:
             self.note_stage("start")
 
     def publish_policy(self) -> None:
-        """Broadcast the newest version."""
-        self._blob = self._snapshot(self._training.network)
-        self._average = b""  # made on request
+        """Broadcast the newest version, with the weights in the precision that updates compute with."""
+        network, precision = self._training.network, self._training.compute.precision
+        self._blob = self._snapshot(network, precision)
+        # The mean is made on request. The newest can't be: within an update the network is between two versions
+        self._to_evaluate = self._snapshot(network) if self._evaluated == "newest" else b""
         self._transport.publish(self._keys.policy(), self._blob, Flow.POLICY)
 
     def note_stage(self, reason: str) -> None:
@@ -91,19 +94,17 @@ class Broadcast:
     def answer(self) -> None:
         """Answer the requests that wait, a bounded number at a time."""
         for request in self._policies.waiting(ANSWERED_AT_ONCE):
-            request.reply(self._averaged() if request.payload == AVERAGE else self._blob)
+            request.reply(self._evaluation() if request.payload == AVERAGE else self._blob)
         for request in self._stage_log.waiting(ANSWERED_AT_ONCE):
             request.reply(encode(StageLog(tuple(self.stages))))
 
-    def _averaged(self) -> bytes:
-        """Return the newest version with the weights that are evaluated."""
-        if self._evaluated == "newest":  # not the network: within an update it is between two versions
-            return self._blob
-        if not self._average:
-            self._average = self._snapshot(self._training.average)
-        return self._average
+    def _evaluation(self) -> bytes:
+        """Return the newest version with the weights that are evaluated, in full precision: they may be kept."""
+        if not self._to_evaluate:
+            self._to_evaluate = self._snapshot(self._training.average)
+        return self._to_evaluate
 
-    def _snapshot(self, network: ActorCritic) -> bytes:
+    def _snapshot(self, network: ActorCritic, precision: Precision = "float32") -> bytes:
         """Return the newest version with the weights of ``network``, encoded."""
         training, progress, identity = self._training, self._training.progress, self._identity
         return encode(
@@ -117,7 +118,7 @@ class Broadcast:
                 frames=progress.frames,
                 contract_hash=identity.contract_hash,
                 training_hash=identity.training_hash,
-                weights=pack(network),
+                weights=pack(network, precision),
                 obs_mean=training.obs_moments.mean,
                 obs_var=training.obs_moments.var,
                 obs_count=training.obs_moments.count,

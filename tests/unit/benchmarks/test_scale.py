@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fuzz.message_examples import make_rollout
+from benchmarks.play import make_training
 from benchmarks.scale.fleet import _shares
 from benchmarks.scale.senders import Sender, sent_by
 from benchmarks.scale.sizes import new_training, policy_sizes, policy_snapshot, rollout_sizes
@@ -13,6 +14,7 @@ from common.comms.memory_transport import MemoryBroker
 from common.comms.messages import ActorReport, Rollout
 from common.comms.transport import Flow
 from services.learner.admission import Header
+from services.learner.config import PPOConfig
 from tests.unit.services.accounting import LEARNER_STATE, make_intake
 
 KEYS = Keys(LEARNER_STATE.run)
@@ -88,23 +90,24 @@ def test_the_bytes_of_all_fields_are_the_message():
     assert found["bytes_per_frame_by_field"]["actions"] == 28.0
 
 
-def test_float16_observations_save_half_of_the_observations_alone():
+def test_observations_and_corrections_travel_in_two_bytes_a_number():
     rollout = make_rollout()
     found = rollout_sizes(rollout)
-    observed = rollout.obs.nbytes + rollout.last_obs.nbytes + rollout.final_obs.nbytes
-    saved = found["bytes_per_frame"] - found["bytes_per_frame_with_float16_observations"]
+    of_field = found["bytes_per_frame_by_field"]
 
-    assert saved * rollout.rewards.size == pytest.approx(observed / 2, abs=0.2 * rollout.rewards.size)
+    assert of_field["obs"] == 2 * rollout.obs.shape[-1]
+    assert of_field["corrections"] == 14.0
     assert 0.0 < found["float16_error_std_mean"] < found["float16_error_std_max"] < 0.01
 
 
-def test_a_policy_in_bfloat16_has_two_bytes_less_for_each_weight():
-    training = new_training()
+@pytest.mark.parametrize(("precision", "saved"), [("float32", 0), ("bfloat16", 2)])
+def test_a_policy_travels_in_the_precision_of_the_updates(precision, saved):
+    training = make_training(PPOConfig(precision=precision), 0)
     found = policy_sizes(training)
-    weights = sum(value.numel() for value in training.network.state_dict().values())
+    matrices = sum(value.numel() for value in training.network.state_dict().values() if value.ndim > 1)
 
     assert found["policy_bytes"] == len(encode(policy_snapshot(training)))
-    assert found["policy_bytes"] - found["policy_bytes_bfloat16"] == 2 * weights
+    assert found["policy_bytes_float32"] - found["policy_bytes"] == pytest.approx(saved * matrices, abs=100)
     assert found["policy_bytes_without_critic"] < found["policy_bytes"]
 
 

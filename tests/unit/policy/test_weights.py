@@ -20,6 +20,7 @@ from common.policy.contract import (
     training_hash,
 )
 from common.policy.folder import Policy, load_policy, mean_policy, save_policy
+from common.policy.network_pass import NetworkPass
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network, pack, unpack
 from common.task.config import TaskConfig
@@ -164,6 +165,22 @@ def test_weights_travel_as_bytes_and_arrive_unchanged():
 
     for name, value in one.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
+
+
+def test_bfloat16_matrices_are_half_as_large_and_act_alike_where_products_are_bfloat16():
+    torch.manual_seed(2)
+    one, other = new_network(NetworkConfig()), new_network(NetworkConfig())
+    obs = torch.randn(64, 37)
+
+    blob = pack(one, "bfloat16")
+    unpack(other, blob)
+
+    assert len(blob) < 0.52 * len(pack(one))
+    for name, value in one.state_dict().items():
+        rounded = value.bfloat16().float() if value.ndim == 2 else value
+        assert torch.equal(rounded, other.state_dict()[name])
+    means = [NetworkPass(network, 64, "bfloat16").act(obs) for network in (one, other)]
+    assert torch.equal(*means)
 
 
 @pytest.mark.parametrize(
