@@ -141,20 +141,21 @@ class Recorder:
         self._progress = asked.folder / PROGRESS
         self._progress.write_text("")
 
-    def note(self, frames: int, policy: Callable[[], "Normalized"]) -> bool:
+    def note(self, frames: int, policy: Callable[[], "Normalized | None"]) -> bool:
         """Note the frames so far, after an update, and keep the policy when it is time; return whether time is up.
 
         Args:
             frames: So far.
-            policy: Returns the deterministic policy, with our trunk and a linear layer.
+            policy: Returns the deterministic policy, with our trunk and a linear layer; None: it is not at hand yet.
         """
         seconds = time.time() - self._asked.started
         with self._progress.open("a", encoding="utf-8") as file:
             file.write(f"{seconds:.3f},{frames}\n")
         is_over = seconds >= self._asked.seconds
-        if seconds >= self._next_snapshot or is_over:
+        found = policy() if seconds >= self._next_snapshot or is_over else None
+        if found is not None:
             self._next_snapshot = seconds + SNAPSHOT_S
-            save(policy(), self._asked.folder / f"{seconds:.1f}-{frames}.pt")
+            save(found, self._asked.folder / f"{seconds:.1f}-{frames}.pt")
         return is_over
 
 

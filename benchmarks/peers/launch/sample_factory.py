@@ -99,9 +99,12 @@ class Observer(AlgoObserver):
         if frames and self._recorder.note(frames, self._policy):
             os._exit(0)  # its other processes are ended from outside
 
-    def _policy(self) -> task.Normalized:
-        """Return the policy of the newest checkpoint: the learner is another process."""
-        newest = max(self._checkpoints.glob("checkpoint_*.pth"), key=lambda file: file.stat().st_mtime)
+    def _policy(self) -> task.Normalized | None:
+        """Return the policy of the newest checkpoint, None before the first: the learner is another process."""
+        files = sorted(self._checkpoints.glob("checkpoint_*.pth"), key=lambda file: file.stat().st_mtime)
+        if not files:
+            return None
+        newest = files[-1]
         state = torch.load(newest, weights_only=False)["model"]
         trunk, mean = task.make_trunk(), nn.Linear(32, task.ACTIONS)
         prefix = "encoder.trunk."
@@ -137,7 +140,7 @@ def main() -> None:
         **{"max_grad_norm": task.GRADIENT_NORM, "exploration_loss_coeff": 0.0, "value_loss_coeff": 1.0},
         **{"adaptive_stddev": False, "initial_stddev": float(np.exp(task.LOG_STD))},
         **{"continuous_tanh_scale": 0.0, "policy_initialization": "torch_default", "with_vtrace": False},
-        **{"shuffle_minibatches": True, "save_every_sec": int(task.SNAPSHOT_S), "with_wandb": False},
+        **{"shuffle_minibatches": True, "save_every_sec": int(task.SNAPSHOT_S / 2), "with_wandb": False},
         **{"train_for_env_steps": 10**10, "use_env_info_cache": False, "log_to_file": False},
         **{"save_best_after": 10**12, "force_envs_single_thread": True, "actor_critic_share_weights": True},
     }
