@@ -10,7 +10,7 @@ WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 2); echo $$((n > 3 ? 4 : n + 1
 STAMP := $(VENV)/.installed
 KERNELS := $(VENV)/.compiled
 MINUTES ?=
-ACTORS ?= 1
+ACTORS ?= 2
 RUN ?=
 POLICY ?=
 VIDEO ?=
@@ -34,7 +34,7 @@ $(KERNELS): $(STAMP)
 	$(BIN)/python -m topspin.compile_kernels
 	@touch $(KERNELS)
 
-train: $(KERNELS)         ## train a robot: make train [MINUTES=10] [ACTORS=2] [RUN=name]
+train: $(KERNELS)         ## train a robot: make train [MINUTES=10] [ACTORS=4] [RUN=name]
 	$(BIN)/topspin train --actors $(ACTORS) $(if $(MINUTES),--minutes $(MINUTES)) $(if $(RUN),--run $(RUN))
 
 play: $(KERNELS)          ## measure a policy and film it: make play [POLICY=folder] [VIDEO=runs/play.mp4]

@@ -12,7 +12,7 @@ from common.service.config import first_look, load, recipe_names
 from common.service.config_sources import read_toml
 from common.service.endpoint import FIRST_PORT
 from common.service.run_folder import LATEST, RunFolder, newest_run
-from common.service.settings import Fleet, RunSettings
+from common.service.settings import LOCAL_ACTORS, MOST_ACTORS, Fleet, RunSettings
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from services.actor.config import ActorOptions
@@ -50,6 +50,13 @@ class DeployConfig(RunSettings, Fleet, BudgetConfig):
         "",
         pattern=r"^$|^(tcp|tls|unixsock-stream)/.+",
         description="where the learner listens; empty: a free port on this machine",
+    )
+    actors: int = Field(
+        LOCAL_ACTORS,
+        ge=1,
+        le=MOST_ACTORS,
+        description="actors: a dataset is one rollout of each, and they share 256 environments. Two play about what "
+        "one learner trains",
     )
     learners: int = Field(
         1,

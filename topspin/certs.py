@@ -15,6 +15,7 @@ from common.comms.roles import OPERATOR_NAME, name_of, rights_of
 from common.service.config import load
 from common.service.log import set_up_logging
 from common.service.process import DONE
+from common.service.settings import LOCAL_ACTORS, MOST_ACTORS
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +39,10 @@ class CertsConfig(BaseModel):
 
     out: str = Field("certs", description="folder to write into; a file in it is never overwritten")
     actors: int = Field(
-        1, ge=1, le=1000, description="actors to make certificates for: actor-0, actor-1, ..."
+        LOCAL_ACTORS,
+        ge=1,
+        le=MOST_ACTORS,
+        description="actors to make certificates for: actor-0, actor-1, ...",
     )
     generators: int = Field(1, ge=1, le=100, description="generators: generator-0, generator-1, ...")
     add: tuple[str, ...] = Field(

@@ -33,7 +33,8 @@ class Point(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    dataset: int = Field(gt=0, description="frames of a dataset; a minibatch was a quarter of it")
+    dataset: int = Field(gt=0, description="frames of a dataset")
+    minibatch: int = Field(gt=0, description="frames of a minibatch")
     frames: int | None = Field(gt=0, description="frames to the goal; null: it was not reached")
     seed: int = Field(ge=0)
     more: str = Field("", description="flags of its training besides those of the dataset's size")
@@ -84,7 +85,8 @@ def read(file: Path) -> LargeBatches | None:
         fault = first_fault(error) if isinstance(error, ValidationError) else error.strerror
         raise ReportedError(
             f"{file}: {fault}; allowed: "
-            '{"return_rate": 0.81, "target_error": 0.31, "points": [{"dataset": 8192, "frames": 9000000, "seed": 0}]}'
+            '{"return_rate": 0.81, "target_error": 0.31, "points": [{"dataset": 8192, "minibatch": 2048, '
+            '"frames": 9000000, "seed": 0}]}'
         ) from None
 
 

@@ -140,7 +140,7 @@ class Episodes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rollout:
-    """One contiguous block of T control steps in B environments, as played."""
+    """One contiguous block of T control steps in B environments, as played. Some of it travels as float16."""
 
     VERSION: ClassVar[int] = 5
 
@@ -152,7 +152,7 @@ class Rollout:
     incarnation: Count
     sequence: Sequence  # from 0 without a gap
     training_hash: Hash  # of the actor's task, network and experience
-    # Raw: the learner normalises. Observations and corrections travel as float16 (ADR-0067)
+    # raw: the learner normalises
     obs: Annotated[F32, Wire("as the observation", "<f4", "T B D", sent="<f2")]
     actions: Annotated[F32, Wire("1", "<f4", "T B 7")]  # as sampled, before the clip to [-1, 1]
     log_mu: Annotated[F32, Wire("1", "<f4", "T B")]  # log density of the action under the policy that acted

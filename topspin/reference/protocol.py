@@ -120,7 +120,7 @@ def _wire(hint: Any) -> Wire:
 
 def _type(hint: Any, wire: Wire) -> str:
     if wire.dtype:
-        return f"array `{wire.dtype.replace('|', '')}`"
+        return f"array `{(wire.sent or wire.dtype).replace('|', '')}`"
     bare = typing.get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
     if typing.get_origin(bare) is tuple:
         return f"list of {_type(typing.get_args(bare)[0], Wire())}"

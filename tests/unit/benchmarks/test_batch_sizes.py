@@ -16,7 +16,7 @@ SIZES = (8192, 32_768, 131_072, 524_288)
 
 @pytest.mark.parametrize("size", SIZES)
 def test_the_flags_make_datasets_of_the_size_in_messages_of_64_mib_at_most(size):
-    config = settings(("--run", "r", *flags_of(size)), "p")
+    config = settings(("--run", "r", *flags_of(size, 0)), "p")
     rollout = config.actor.envs * config.actor.horizon
 
     assert config.actors * rollout == size
@@ -27,12 +27,12 @@ def test_the_flags_make_datasets_of_the_size_in_messages_of_64_mib_at_most(size)
 @pytest.mark.parametrize("size", [0, 8200, 600_001])
 def test_a_size_that_is_no_whole_number_of_rollouts_is_refused(size):
     with pytest.raises(ReportedError, match=f"^dataset of {size} frames; allowed: a multiple of "):
-        flags_of(size)
+        flags_of(size, 2048)
 
 
 def test_all_sizes_have_their_first_seed_before_one_has_its_second():
     config = BatchSizesConfig(sizes=(8192, 32_768), seeds=(3, 4))
-    points = (Point(dataset=32_768, frames=None, seed=3),)
+    points = (Point(dataset=32_768, minibatch=2048, frames=None, seed=3),)
 
     assert missing(config, points) == [(8192, 3), (8192, 4), (32_768, 4)]
 
@@ -49,7 +49,12 @@ def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, mon
 
     monkeypatch.setattr(batch_sizes, "train", train)
     config = BatchSizesConfig(
-        sizes=(8192, 32_768), run="b", frames=20_000_000, out=tmp_path / "found.json", json_line=True
+        sizes=(8192, 32_768),
+        run="b",
+        frames=20_000_000,
+        minibatch=0,
+        out=tmp_path / "found.json",
+        json_line=True,
     )
     main(config, stop)
     first = read(config.out).points
@@ -61,8 +66,8 @@ def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, mon
         == "--actors 2 --actor.envs 128 --actor.horizon 32 --learner.ppo.minibatch 2048 --frames 20000000"
     )
     assert first == (
-        Point(dataset=8192, frames=9_000_000, seed=0),
-        Point(dataset=32_768, frames=None, seed=0),  # it trained to its end
+        Point(dataset=8192, minibatch=2048, frames=9_000_000, seed=0),
+        Point(dataset=32_768, minibatch=8192, frames=None, seed=0),  # it trained to its end
     )
     assert len(read(config.out).points) == 4
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])

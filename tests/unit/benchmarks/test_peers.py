@@ -66,7 +66,11 @@ def test_policies_are_kept_now_and_then_and_at_the_end(tmp_path):
     assert len(list(tmp_path.glob("*.pt"))) == 1
 
     waits = task.Recorder(make_order(tmp_path, ago=task.SNAPSHOT_S + 1.0))
-    for frames, policy in ((10, None), (11, make_policy()), (12, make_policy())):  # its learner saves by itself
+    for frames, policy in (
+        (10, None),
+        (11, make_policy()),
+        (12, make_policy()),
+    ):  # its learner saves by itself
         waits.note(frames, lambda policy=policy: policy)
     assert len(list(tmp_path.glob("*-11.pt"))) == 1
     assert len(list(tmp_path.glob("*-1[02].pt"))) == 0

@@ -187,7 +187,10 @@ def test_without_measured_trainings_there_are_rates_and_bounds_and_no_minutes(co
 
 
 def test_with_measured_trainings_there_are_minutes(costs_file, tmp_path, capsys):
-    points = [{"dataset": d, "frames": round(8e6 * (1 + d / 60_000)), "seed": 0} for d in (4096, 131_072)]
+    points = [
+        {"dataset": d, "minibatch": d // 4, "frames": round(8e6 * (1 + d / 60_000)), "seed": 0}
+        for d in (4096, 131_072)
+    ]
     file = tmp_path / "points.json"
     file.write_text(json.dumps({"return_rate": 0.81, "target_error": 0.31, "points": points}))
     found, said = printed(capsys, costs=costs_file, cores=(2,), points=str(file), learner_frames_per_s=3e5)

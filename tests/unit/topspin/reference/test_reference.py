@@ -55,7 +55,7 @@ def test_the_protocol_page_has_every_message_and_field():
         ]
         for field in dataclasses.fields(message):
             assert f"| `{field.name}` |" in section
-    assert "| `obs` | array `<f4` | as the observation | T B D | raw: the learner normalises |" in page
+    assert "| `obs` | array `<f2` | as the observation | T B D | raw: the learner normalises |" in page
     assert "| `sequence` | integer | 1 |  | from 0 without a gap |" in page
 
 
