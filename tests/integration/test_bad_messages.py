@@ -4,12 +4,13 @@ import dataclasses
 
 import msgpack
 import numpy as np
+import torch
+from safetensors.torch import load, save
 
 from common.comms.codec import decode, encode
 from common.comms.keys import Keys
 from common.comms.messages import ActorReport, PolicySnapshot, RallyBatch, StageChange, Status, Verdict
 from common.comms.transport import Flow, NoReply
-from common.policy.weights import load_tensors, save_tensors
 from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION
 from tests.integration.in_process_run import CURRICULUM, DATASET, local_run
@@ -162,10 +163,10 @@ def test_workers_refuse_bad_messages_and_play_on(tmp_path):
         client = ForeignClient(s.peer())
         publish, request = client.transport.publish, client.transport.request
         newest = client.policy()
-        tensors = {name: np.full_like(value, np.nan) for name, value in load_tensors(newest.weights).items()}
+        tensors = {name: torch.full_like(value, torch.nan) for name, value in load(newest.weights).items()}
         higher = {"generation": newest.generation + 9, "version": 10**6}
         bad_policies = [
-            encode(dataclasses.replace(newest, **higher, weights=save_tensors(tensors))),
+            encode(dataclasses.replace(newest, **higher, weights=save(tensors))),
             encode(dataclasses.replace(newest, **higher, weights=b"rubbish")),
             encode(dataclasses.replace(newest, **higher, obs_mean=np.zeros(3), obs_var=np.ones(3))),
             encode(newest)[:-9],

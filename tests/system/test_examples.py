@@ -23,7 +23,7 @@ def example(folder, name, *arguments):
 
 
 def test_a_run_is_watched(tmp_path):
-    names = ["learner-0", "evaluator-0", "generator-0", "actor-0"]
+    names = ["learner-0", "evaluator-0", "generator-0", "actor-0", "actor-1"]
 
     def is_ready():
         done = example(tmp_path, "watch_run.py", "r")
