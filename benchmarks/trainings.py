@@ -23,10 +23,8 @@ from topspin.report.groups import experiment
 
 KEPT: Final = Path(__file__).parent / "results" / "runs"
 LOOK_S: Final = 1.0
-CURVE: Final = (
-    "--evaluator.interval-s",
-    "120",
-)  # enough points for a curve; more often costs up to 7 % of the frames
+# Enough points for a curve; more often costs up to 7 % of the frames
+CURVE: Final = ("--evaluator.interval-s", "120")
 BY_NAME: Final = ("seed", "frames")  # settings that make no other experiment, but other figures
 
 

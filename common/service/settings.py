@@ -12,9 +12,7 @@ from common.comms.zenoh_config import LinkConfig, ZenohConfig
 from common.service.endpoint import FIRST_PORT
 
 MOST_ACTORS: Final = 1000
-LOCAL_ACTORS: Final = (
-    2  # of a run on one machine: they play about what one learner trains, and fill two cores with it
-)
+LOCAL_ACTORS: Final = 2  # of a run on one machine: they play about what one learner trains
 FROM_LEARNER: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
     {
         "": ("seed", "actors", "generators", "shards", "lease_s", "max_message_mib"),
