@@ -3,8 +3,9 @@
     python -m benchmarks.batch_sizes --sizes 8192,32768,131072 --seeds 0,1 --json
 
 Each training is one of ``benchmarks.time_to_quality``: a passage counts only if other balls confirm it. Two actors
-(four for the largest) play as many environments as a dataset needs. So the frames are those of a hundred actors, and
-the minutes are not. ``--minibatch`` and ``--more`` try other rules, for a file of their own (``--out``).
+(four for the largest) play as many environments as a dataset needs, and a minibatch is a quarter of it. So the frames
+are those of a hundred actors, and the minutes are not. ``--minibatch`` and ``--more`` try other rules: give their
+trainings a file of their own (``--out``), since ``benchmarks.scaling`` counts the steps of such minibatches.
 Trainings are written to ``results/large_batches.json``, from which ``benchmarks.scaling`` fits its law. What is in the
 file is not trained again.
 """
@@ -26,11 +27,11 @@ from benchmarks.time_to_quality import RETURN_RATE, TARGET_ERROR, TimeToQualityC
 from common.errors import ReportedError
 from common.service.process import DONE
 from common.service.whole_file import write_whole
-from services.learner.config import PPOConfig
 
 HORIZON: Final = 32  # control steps of a rollout
 FEWEST_ACTORS: Final = 2
-LARGEST_ROLLOUT: Final = 131_072  # frames: 43 MB, and a message may have 64 MiB
+MINIBATCHES: Final = 4  # of a dataset, as the law assumes
+LARGEST_ROLLOUT: Final = 131_072  # frames: 26 MB, and a message may have 64 MiB
 
 
 class BatchSizesConfig(BenchmarkConfig):
@@ -54,7 +55,7 @@ class BatchSizesConfig(BenchmarkConfig):
         "stopped goes on",
     )
     minibatch: int = Field(
-        PPOConfig().minibatch,
+        0,
         ge=0,
         description="of each training; 0: a quarter of its dataset",
         json_schema_extra={"unit": "frames"},
@@ -66,10 +67,6 @@ class BatchSizesConfig(BenchmarkConfig):
 
 def flags_of(size: int, minibatch: int) -> list[str]:
     """Return the flags of deploy.local for datasets and minibatches of so many frames.
-
-    Args:
-        size: Of a dataset.
-        minibatch: 0: a quarter of it.
 
     Raises:
         ReportedError: No whole number of environments makes such a dataset.
@@ -84,7 +81,7 @@ def flags_of(size: int, minibatch: int) -> list[str]:
         "--actors": actors,
         "--actor.envs": envs,
         "--actor.horizon": HORIZON,
-        "--learner.ppo.minibatch": minibatch or size // 4,
+        "--learner.ppo.minibatch": minibatch,
     }
     return [text for name, value in flags.items() for text in (name, str(value))]
 
@@ -104,14 +101,15 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
     for size, seed in missing(config, points) if config.train else ():
         if stop.is_set():
             break
-        flags = [*flags_of(size, config.minibatch), "--frames", str(config.frames), *shlex.split(config.more)]
+        minibatch = config.minibatch or size // MINIBATCHES
+        flags = [*flags_of(size, minibatch), "--frames", str(config.frames), *shlex.split(config.more)]
         settings = TimeToQualityConfig(minutes=1e6, more=shlex.join(flags))
         found = train(settings, f"{base}-{size}-{seed}", seed, stop, resumes=True)
         if stop.is_set() and not found["reached"]:
             break  # it was stopped, and says nothing
         point = Point(
             dataset=size,
-            minibatch=config.minibatch or size // 4,
+            minibatch=minibatch,
             frames=found["frames"] if found["reached"] else None,
             seed=seed,
             more=config.more,

@@ -16,7 +16,7 @@ SIZES = (8192, 32_768, 131_072, 524_288)
 
 @pytest.mark.parametrize("size", SIZES)
 def test_the_flags_make_datasets_of_the_size_in_messages_of_64_mib_at_most(size):
-    config = settings(("--run", "r", *flags_of(size, 0)), "p")
+    config = settings(("--run", "r", *flags_of(size, size // 4)), "p")
     rollout = config.actor.envs * config.actor.horizon
 
     assert config.actors * rollout == size
