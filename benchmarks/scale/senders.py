@@ -18,7 +18,7 @@ from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from services.actor import outbox as box
 from services.actor.config import OutboxConfig
-from services.actor.service import REPORT_INTERVAL_S
+from services.actor.delivery import REPORT_INTERVAL_S
 
 PAUSE_S = 0.002
 REQUEST_S = 10.0

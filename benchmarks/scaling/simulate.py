@@ -30,7 +30,7 @@ from services.learner.intake import Intake, Queued
 from services.learner.turns import Rank, parts, taken
 
 # Pauses of services whose modules import torch; a test compares them
-REPORT_INTERVAL_S: Final = 0.25  # services.actor.service
+REPORT_INTERVAL_S: Final = 0.25  # services.actor.delivery
 TURN_WAIT_S: Final = 0.02  # services.learner.service
 RECOUNT_S: Final = 0.5  # services.learner.lockstep
 
@@ -195,7 +195,7 @@ class _Run:
         if one.process is not None:
             self.machine.wake(one.process)
 
-    # ---- actors (services.actor.service)
+    # ---- actors (services.actor.service, .policy_feed, .delivery)
 
     def _actor(self, actor: _Actor) -> Script:
         play = self.costs.playing(self.plan.envs) + self.costs.send.of(self.bytes)

@@ -118,7 +118,7 @@ def test_an_actor_comes_back_from_forged_answers(tmp_path):
             for server in servers:
                 for request in server.waiting(64):
                     request.reply(forged)
-            return actor.service._outbox.credit_version == 2**61
+            return actor.service._delivery.outbox.credit_version == 2**61
 
         wait_until(answer, 30, "forged credits")
         for server in servers:

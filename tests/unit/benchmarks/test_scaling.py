@@ -16,7 +16,7 @@ from benchmarks.scaling.simulate import (
     simulate,
 )
 from common.errors import ReportedError
-from services.actor import service as actor_service
+from services.actor import delivery
 from services.learner import lockstep
 from services.learner import service as learner_service
 from services.learner.group import Group
@@ -189,7 +189,7 @@ def test_background_load_that_leaves_no_core_is_refused():
 
 
 def test_the_pauses_are_those_of_the_services():
-    assert REPORT_INTERVAL_S == actor_service.REPORT_INTERVAL_S
+    assert REPORT_INTERVAL_S == delivery.REPORT_INTERVAL_S
     assert TURN_WAIT_S == learner_service.TURN_WAIT_S
     assert RECOUNT_S == lockstep.RECOUNT_S
 
