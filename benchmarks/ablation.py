@@ -21,7 +21,7 @@ from typing import Any, Final
 from pydantic import Field
 
 from benchmarks.recipe import MEASURES, medians, result
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, as_flags, run
 from benchmarks.trainings import Wanted, made, make
 from common.service.process import DONE, FAILED
 from topspin.report.paired import over_seeds
@@ -57,9 +57,8 @@ class AblationConfig(BenchmarkConfig):
 
 def wanted(config: AblationConfig, arm: str, seed: int) -> Wanted:
     """Return the training of an arm with one seed."""
-    flags = [text for name, value in (BASE | ARMS[arm]).items() for text in (f"--{name}", value)]
     name = arm.replace("'", "").replace(" ", "-")
-    own = ("--seed", str(seed), "--frames", str(config.frames), *flags, *config.more)
+    own = ("--seed", str(seed), "--frames", str(config.frames), *as_flags(BASE | ARMS[arm]), *config.more)
     return Wanted(f"{config.run}-{name}-{seed}", own)
 
 

@@ -22,7 +22,7 @@ from typing import Final
 from pydantic import Field
 
 from benchmarks.scaling.large_batches import FILE, LargeBatches, Point, read
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, as_flags, run
 from benchmarks.time_to_quality import RETURN_RATE, TARGET_ERROR, TimeToQualityConfig, train
 from common.errors import ReportedError
 from common.service.process import DONE
@@ -78,12 +78,12 @@ def flags_of(size: int, minibatch: int) -> list[str]:
             f"dataset of {size} frames; allowed: a multiple of {HORIZON * actors}, {actors} rollouts"
         )
     flags = {
-        "--actors": actors,
-        "--actor.envs": envs,
-        "--actor.horizon": HORIZON,
-        "--learner.ppo.minibatch": minibatch,
+        "actors": actors,
+        "actor.envs": envs,
+        "actor.horizon": HORIZON,
+        "learner.ppo.minibatch": minibatch,
     }
-    return [text for name, value in flags.items() for text in (name, str(value))]
+    return as_flags(flags)
 
 
 def missing(config: BatchSizesConfig, points: tuple[Point, ...]) -> list[tuple[int, int]]:

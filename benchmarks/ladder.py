@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 from pydantic import Field
 
 from benchmarks.recipe import MEASURES, medians, result
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, as_flags, run
 from benchmarks.trainings import Wanted, made, make
 from common.errors import ReportedError
 from common.service.process import DONE, FAILED
@@ -115,7 +115,7 @@ def flags_of(rung: int) -> list[str]:
     together: dict[str, str] = {}
     for one in RUNGS[: rung + 1]:
         together |= one.flags
-    return [part for name, value in together.items() for part in (f"--{name}", value)]
+    return as_flags(together)
 
 
 def wanted(config: LadderConfig, rung: int, seed: int) -> Wanted:

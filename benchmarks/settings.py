@@ -40,6 +40,11 @@ def print_figures(figures: Mapping[str, object], as_json: bool) -> None:
         print(json.dumps(figures))
 
 
+def as_flags(values: Mapping[str, object]) -> list[str]:
+    """Return settings by name as flags of a command: --NAME VALUE."""
+    return [text for name, value in values.items() for text in (f"--{name}", str(value))]
+
+
 _Config = TypeVar("_Config", bound=BenchmarkConfig)
 
 

@@ -23,6 +23,7 @@ from common.comms.keys import Keys
 from common.comms.messages import Status
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
+from common.service.member import LEARNER_ID
 from common.service.process import DONE
 from common.service.run_folder import LATEST, RUNS
 from common.service.table import whole_rows
@@ -52,7 +53,7 @@ def measure(run: PreparedRun, warm_up_s: float, seconds: float, stop: Event) -> 
                 check_learner(run, supervisor)
                 for sample in statuses.poll():
                     status = decode(sample.payload, Status)
-                    if status.role == "learner":
+                    if (status.role, status.id) == ("learner", LEARNER_ID):
                         learner = status
                 transport.wait(0.5)
 

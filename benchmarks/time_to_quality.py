@@ -27,7 +27,7 @@ from typing import Any, Final, NamedTuple
 
 from pydantic import Field
 
-from benchmarks.settings import BenchmarkConfig, run
+from benchmarks.settings import BenchmarkConfig, as_flags, run
 from common.errors import ReportedError
 from common.policy.contract import PolicyError
 from common.policy.folder import load_policy, save_policy
@@ -140,8 +140,7 @@ def match_flags(policy: Path) -> list[str]:
     conditions = MatchConditions.model_validate(
         load_policy(policy).contract.task.model_dump(include=set(MatchConditions.model_fields))
     )
-    named = ((f"--{name.replace('_', '-')}", str(value)) for name, value in conditions)
-    return [text for pair in named for text in pair]
+    return as_flags({name.replace("_", "-"): value for name, value in conditions})
 
 
 def measure(policy: Path, seed: int) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from common.comms.zenoh_config import ZenohConfig
 from common.comms.zenoh_transport import open_zenoh
 from common.errors import ReportedError
 from common.evaluation.evaluate import check
+from common.service.member import LEARNER_ID
 from deploy.prepare import free_endpoint
 
 RUN: Final = "scale"
@@ -185,7 +186,7 @@ def measure(fleet: Fleet, warm_up_s: float, seconds: float, stop: Event) -> dict
                 link.wait(0.2)
                 for sample in statuses.poll():
                     status = decode(sample.payload, Status)
-                    if status.role == "learner" and time.monotonic() >= until:
+                    if (status.role, status.id) == ("learner", LEARNER_ID) and time.monotonic() >= until:
                         return status, running.cpu(), running.sent()
                 if time.monotonic() > until + 60.0:
                     raise ReportedError("no heartbeat of the learner for 60 s")
