@@ -67,7 +67,9 @@ class Broadcast:
         network, precision = self._training.network, self._training.compute.precision
         self._blob = self._snapshot(network, precision)
         # The mean is made on request. The newest can't be: within an update the network is between two versions
-        self._to_evaluate = self._snapshot(network) if self._evaluated == "newest" else b""
+        self._to_evaluate = b""
+        if self._evaluated == "newest":
+            self._to_evaluate = self._blob if precision == "float32" else self._snapshot(network)
         self._transport.publish(self._keys.policy(), self._blob, Flow.POLICY)
 
     def note_stage(self, reason: str) -> None:

@@ -14,8 +14,7 @@ from common.comms.transport import Transport
 from common.comms.zenoh_config import endpoint_for_others
 from common.env.teacher import teacher_of
 from common.errors import ReportedError
-from common.policy.contract import Contract, contract_hash, contract_of, training_hash
-from common.policy.folder import save_policy
+from common.policy.contract import contract_hash, training_hash
 from common.service.config import save_settings, to_tables
 from common.service.history import History
 from common.service.member import LEARNER_ID, Member
@@ -26,10 +25,10 @@ from services.learner.admission import LearnerState
 from services.learner.broadcast import Broadcast, Identity
 from services.learner.budget import ENDING_S, NOTHING_LEFT, Budget
 from services.learner.config import LearnerConfig
-from services.learner.divergence import NOT_FINITE
 from services.learner.generation import next_generation
 from services.learner.group import ALONE, Group
 from services.learner.intake import Queued
+from services.learner.keeper import Keeper
 from services.learner.ledger import Ledger
 from services.learner.lockstep import Lockstep
 from services.learner.members import IDLE_WAIT_S
@@ -46,14 +45,6 @@ TURN_WAIT_S: Final = 0.02  # pause between the turns of a group that waits for r
 
 class RunExistsError(ReportedError):
     """A new run would overwrite an old one's checkpoints."""
-
-
-class NotSavedError(ReportedError):
-    """The run folder can't be written."""
-
-
-class DivergedError(ReportedError):
-    """Training has diverged and cannot go back."""
 
 
 @dataclass(slots=True)
@@ -113,6 +104,7 @@ class LearnerService:
         self._training_hash = training_hash(task, config.network, config.experience)
         self._clocks = Clocks(clock())
         self._history = History(config.history, "learner-0")
+        self._keeper = Keeper(config, self._folder, self.training, group, metrics, self._history)
         file, extras = self._restore() if config.resume else (None, None)
         if self.training.is_distilling:
             # Raises here if the teacher does not fit: otherwise actors would end because of it, for ever restarted
@@ -259,27 +251,12 @@ class LearnerService:
     def save(self, is_last: bool = False) -> None:
         """Write checkpoint and policy/latest; parameters that are not finite never replace good ones.
 
-        Where that fails, such as on a full disk, training goes on, and the next one is tried in its time.
-
         Args:
             is_last: Whether this process trains no more. Then the checkpoint also keeps the rollouts that wait.
 
         Raises:
             NotSavedError: The last state can't be saved.
         """
-        try:
-            self._save(is_last)
-        except OSError as error:
-            self._metrics.inc("topspin_failed_saves_total")
-            where = error.filename or self._folder.root
-            text = f"epoch {self.training.progress.epoch} can't be saved in {where}: {error.strerror}"
-            if is_last:
-                older = checkpoint.checkpoints(self._folder.checkpoints)
-                kept = f"the newest checkpoint is {older[-1]}" if older else "there is no checkpoint"
-                raise NotSavedError(f"{text}; {kept}") from None
-            log.error("%s; training goes on, next try in %.0f s", text, self._config.checkpoint_interval_s)
-
-    def _save(self, is_last: bool) -> None:
         if not self.training.is_finite:
             log.error("not saved: parameters are not finite epoch=%d", self.training.progress.epoch)
             return
@@ -290,18 +267,7 @@ class LearnerService:
             trained_seconds=self.seconds,
             **self._lockstep.collected(self._intake, is_last),
         )
-        path = checkpoint.save(self._folder.checkpoints, self.training, extras)
-        if self.training.progress.is_worth_going_back_to:
-            checkpoint.keep(path, self._folder.checkpoints / checkpoint.GOOD)
-        weights = self.training.weights(self._config.evaluated_weights)
-        save_policy(self._folder.latest_policy, weights, self.training.obs_moments, self._contract())
-        self._metrics.set("topspin_checkpoint_time_seconds", time.time())
-        self._history.note(
-            "saved",
-            **where(self.training, self._generation),
-            waiting=lives(self._intake.waiting) if is_last else [],
-        )
-        log.debug("checkpoint written file=%s", path)
+        self._keeper.save(extras, lives(self._intake.waiting) if is_last else [], is_last)
 
     # ---- training
 
@@ -316,7 +282,7 @@ class LearnerService:
         if stats.stage_changed:
             self._broadcast.note_stage("curriculum")
         if stats.diverged:
-            self._go_back(stats.diverged)
+            self._keeper.go_back(stats.diverged)
         lost = self._intake.finish_update(self._learner_state())
         self._history.note(
             "trained", **where(self.training, self._generation), rollouts=lives(dataset), lost=lives(lost)
@@ -336,42 +302,14 @@ class LearnerService:
         telemetry.measure_epoch(self._metrics, stats, rate, now - started)
         self._warned = False
 
-    def _go_back(self, reason: str) -> None:
-        """Return to the last good checkpoint, if there is one."""
-        good = checkpoint.checkpoints(self._folder.checkpoints / checkpoint.GOOD)
-        if not good:
-            if reason == NOT_FINITE:
-                raise DivergedError(
-                    f"training has diverged: {reason}, and there is no good checkpoint to go back to; "
-                    "try a lower --ppo.learning-rate-max"
-                )
-            self._group.of_leader(b"")
-            self.training.forget_health()
-            log.warning("training has diverged reason=%r; no good checkpoint yet, going on", reason)
-            return
-        path = good[-1]
-        if self._group.size > 1:
-            self._group.of_leader(path.read_bytes())
-        self.training.go_back(lambda training: checkpoint.restore(path, training))
-        self._metrics.inc("topspin_rollbacks_total")
-        log.warning("training has diverged reason=%r; went back to file=%s", reason, path)
-
     def _learner_state(self) -> LearnerState:
         return self.training.state_of(self._config.run, self._generation, self._training_hash)
 
     def _restore(self) -> tuple[Path, checkpoint.Extras]:
         """Load the newest whole checkpoint; return it, and what the service keeps in it."""
-        file, extras = checkpoint.restore_newest(self._folder.checkpoints, self.training)
+        file, extras = self._keeper.restore()
         self._clocks.resumed_seconds = extras.trained_seconds
-        progress = self.training.progress
-        self._run_log.truncate(progress.epoch, progress.frames)
-        log.info(
-            "resumed file=%s epoch=%d frames=%d waiting=%d",
-            file,
-            self.training.progress.epoch,
-            self.training.progress.frames,
-            len(extras.queue),
-        )
+        self._run_log.truncate(self.training.progress.epoch, self.training.progress.frames)
         return file, extras
 
     # ---- messages
@@ -406,19 +344,6 @@ class LearnerService:
             )
 
     # ---- numbers
-
-    def _contract(self) -> Contract:
-        config, progress = self._config, self.training.progress
-        return contract_of(
-            config.task,
-            config.experience,
-            config.network,
-            run=config.run,
-            generation=self._generation,
-            version=progress.version,
-            stage=progress.stage,
-            frames=progress.frames,
-        )
 
     def _beat(self) -> None:
         self._intake.tidy(self._clock())

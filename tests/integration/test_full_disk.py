@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from services.learner import checkpoint
-from services.learner.service import NotSavedError
+from services.learner.keeper import NotSavedError
 from tests.full_disk import files_up_to
 from tests.integration.in_process_run import LONG, local_run, progress
 from tests.waiting import wait_until

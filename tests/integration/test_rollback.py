@@ -8,7 +8,7 @@ import torch
 from safetensors.numpy import load_file
 
 from services.learner.checkpoint import checkpoints
-from services.learner.service import DivergedError
+from services.learner.keeper import DivergedError
 from tests.integration.in_process_run import DATASET, LONG, local_run, progress
 from tests.waiting import wait_until
 
