@@ -4,10 +4,10 @@
 
 Each training is one of ``benchmarks.time_to_quality``: a passage counts only if other balls confirm it. Two actors
 (four for the largest) play as many environments as a dataset needs, and a minibatch is a quarter of it. So the frames
-are those of a hundred actors, and the minutes are not. ``--minibatch`` and ``--more`` try other rules: give their
-trainings a file of their own (``--out``), since ``benchmarks.scaling`` counts the steps of such minibatches.
-Trainings are written to ``results/large_batches.json``, from which ``benchmarks.scaling`` fits its law. What is in the
-file is not trained again.
+are those of a hundred actors, and the minutes are not. Trainings are written to ``results/large_batches.json``, from
+which ``benchmarks.scaling`` fits its law. What is in the file is not trained again, unless it missed the goal with
+fewer ``--frames``. ``--minibatch`` and ``--more`` try other rules, and need a file of their own (``--out``), since
+``benchmarks.scaling`` counts the steps of the first one.
 """
 
 import json
@@ -15,6 +15,7 @@ import math
 import shlex
 import sys
 import time
+from operator import attrgetter
 from pathlib import Path
 from threading import Event
 from typing import Final
@@ -31,6 +32,7 @@ from common.service.whole_file import write_whole
 HORIZON: Final = 32  # control steps of a rollout
 FEWEST_ACTORS: Final = 2
 MINIBATCHES: Final = 4  # of a dataset, as the law assumes
+RULE: Final = attrgetter("dataset", "minibatch", "more")
 LARGEST_ROLLOUT: Final = 131_072  # frames: 26 MB, and a message may have 64 MiB
 
 
@@ -86,14 +88,29 @@ def flags_of(size: int, minibatch: int) -> list[str]:
     return as_flags(flags)
 
 
+def minibatch_of(config: BatchSizesConfig, size: int) -> int:
+    """Return the frames of a minibatch with datasets of so many frames."""
+    return config.minibatch or size // MINIBATCHES
+
+
+def answers(point: Point, config: BatchSizesConfig) -> bool:
+    """Return whether a training is one of those that are wanted now."""
+    is_same = (point.minibatch, point.more) == (minibatch_of(config, point.dataset), config.more)
+    return is_same and (point.frames is not None or point.limit >= config.frames)
+
+
 def missing(config: BatchSizesConfig, points: tuple[Point, ...]) -> list[tuple[int, int]]:
     """Return size and seed of the trainings that ``points`` lacks: the first seed of all sizes, then the next."""
-    known = {(point.dataset, point.seed) for point in points}
+    known = {(point.dataset, point.seed) for point in points if answers(point, config)}
     return [(size, seed) for seed in config.seeds for size in config.sizes if (size, seed) not in known]
 
 
 def main(config: BatchSizesConfig, stop: Event) -> int:
     """Train what is missing, write it, and print the trainings."""
+    if config.out == FILE and (config.minibatch or config.more):
+        raise ReportedError(
+            f"--minibatch or --more with --out {FILE}; allowed: another file, since this one is of one rule"
+        )
     goal = {"return_rate": RETURN_RATE, "target_error": TARGET_ERROR}
     known = read(config.out)
     points = known.points if known else ()
@@ -101,20 +118,23 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
     for size, seed in missing(config, points) if config.train else ():
         if stop.is_set():
             break
-        minibatch = config.minibatch or size // MINIBATCHES
+        minibatch = minibatch_of(config, size)
         flags = [*flags_of(size, minibatch), "--frames", str(config.frames), *shlex.split(config.more)]
         settings = TimeToQualityConfig(minutes=1e6, more=shlex.join(flags))
         found = train(settings, f"{base}-{size}-{seed}", seed, stop, resumes=True)
-        if stop.is_set() and not found["reached"]:
+        if found is None:
             break  # it was stopped, and says nothing
         point = Point(
             dataset=size,
             minibatch=minibatch,
             frames=found["frames"] if found["reached"] else None,
+            limit=config.frames,
             seed=seed,
             more=config.more,
         )
-        points = (*points, point)
+        # It takes the place of one that missed the goal with fewer frames
+        others = [one for one in points if (*RULE(one), one.seed) != (*RULE(point), seed)]
+        points = (*others, point)
         write_whole(config.out, LargeBatches(**goal, points=points).model_dump_json(indent=1) + "\n")
         print(f"dataset {size}  seed {seed}  frames {point.frames}", file=sys.stderr, flush=True)
     if config.json_line:

@@ -3,12 +3,13 @@
     python -m benchmarks.time_to_quality --seeds 5 --json
 
 Each seed is a real run of `deploy.local`, one after the other. Its evaluator's curve says when a policy may have
-reached the goal: 81 % of 1,000 balls returned, 0.31 m from the target. That policy then plays 1,000 other balls while
-training goes on, and the time counts only if it meets the goal on these as well: balls that choose a policy flatter
-it. The figures printed for a run are those of a third set of balls. Time is wall time from the start of the command,
-with imports and start-up. A run that does not reach the goal counts as slower than all that do. Balls, noise and
-contacts are those of the training (``--more``). Each seed's figures are kept with its run: with ``--run NAME`` the
-program goes on where it was stopped, with the next seed.
+reached the goal: 81 % of 1,000 balls returned, 0.31 m from the target. Every evaluated policy is kept, and the one of
+such a row plays 1,000 other balls while training goes on. The time counts only if it meets the goal on these as well:
+balls that choose a policy flatter it. The figures printed for a run are those of a third set of balls. Time is wall
+time from the start of the command, with imports and start-up. A run that does not reach the goal counts as slower than
+all that do. Balls, noise and contacts are those of the training (``--more``). Each seed's figures are kept with its
+run: with ``--run NAME`` the program goes on with the next seed. A seed that was stopped is trained anew, since its time
+is unknown; what it left is moved aside.
 """
 
 import csv
@@ -20,7 +21,8 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -28,9 +30,9 @@ from typing import Any, Final, NamedTuple
 from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, as_flags, run
+from benchmarks.trainings import Wanted, check
 from common.errors import ReportedError
-from common.policy.contract import PolicyError
-from common.policy.folder import load_policy, save_policy
+from common.policy.folder import load_policy
 from common.service.run_folder import RunFolder
 from common.service.table import whole_rows
 from common.service.whole_file import write_whole
@@ -38,7 +40,6 @@ from common.task.config import MatchConditions
 
 RETURN_RATE, TARGET_ERROR = 0.81, 0.31  # [share], [m] the paper's table
 LOOK_S: Final = 1.0
-SAVED_S: Final = 10.0  # in which the policy of a row is written
 PATIENCE_S: Final = 180.0  # in which a run ends and measures its policy
 RALLIES: Final = 1000
 # The run's evaluator chooses on the rallies of the run's seed. These are other ones:
@@ -91,48 +92,16 @@ class Goal(NamedTuple):
 
 
 def first_passage(
-    curve: Sequence[Mapping[str, Any]],
-    asked: int,
-    goal: Goal,
-    is_confirmed: Callable[[Mapping[str, Any]], bool],
+    rows: Iterable[Mapping[str, Any]], goal: Goal, is_confirmed: Callable[[Mapping[str, Any]], bool]
 ) -> Mapping[str, Any] | None:
-    """Return the row of a curve in which the goal was first reached, or None.
-
-    Only the newest row is confirmed: the policies of others are no longer at hand.
+    """Return the first row of a curve in which the goal is reached, or None.
 
     Args:
-        curve: Evaluations so far.
-        asked: Rows that have been looked at before.
+        rows: Evaluations, oldest first.
         goal: What counts.
-        is_confirmed: Returns whether the policy of a row is at hand, and meets the goal on other balls.
+        is_confirmed: Returns whether the policy of a row meets the goal on other balls.
     """
-    if len(curve) <= asked or not goal.is_met(curve[-1]):
-        return None
-    return curve[-1] if is_confirmed(curve[-1]) else None
-
-
-def kept(folder: RunFolder, row: Mapping[str, Any], wait_s: float = SAVED_S) -> Path | None:
-    """Return a copy of the policy that a row of a run's curve measured, or None if it is not at hand.
-
-    Training goes on, and a better policy may replace it at any time. The row is written a moment before its policy.
-
-    Args:
-        folder: Of the run.
-        row: Of its curve.
-        wait_s: For the policy.
-    """
-    until = time.monotonic() + wait_s
-    while True:
-        try:
-            policy = load_policy(folder.best_policy)
-        except PolicyError:
-            policy = None
-        if policy is not None and policy.contract.version == int(row["version"]):
-            save_policy(copy := folder.report / "passed", policy.network, policy.moments, policy.contract)
-            return copy
-        if time.monotonic() >= until:
-            return None
-        time.sleep(0.1)
+    return next((row for row in rows if goal.is_met(row) and is_confirmed(row)), None)
 
 
 def match_flags(policy: Path) -> list[str]:
@@ -161,8 +130,8 @@ def measure(policy: Path, seed: int) -> dict[str, Any]:
 
 def train(
     config: TimeToQualityConfig, name: str, seed: int, stop: Event, resumes: bool = False
-) -> dict[str, Any]:
-    """Train a run until the goal or the end of its time, and return its figures.
+) -> dict[str, Any] | None:
+    """Train a run until the goal or the end of its time, and return its figures; None if it was stopped before.
 
     Args:
         config: Settings.
@@ -170,53 +139,59 @@ def train(
         seed: Of the run.
         stop: Ends it.
         resumes: Whether a run that is there goes on; its minutes are then those since now.
+
+    Raises:
+        ReportedError: The run that is there has other settings, or the training failed.
     """
     folder, goal = RunFolder.of(name), Goal(config.return_rate, config.target_error)
-    is_there = folder.config.exists()
-    if is_there and not resumes:
-        raise ReportedError(f"{folder.root} is there already, and its curve is older; choose another --run")
-    run = ["--run", name, "--resume"] if is_there else ["--run", name, "--seed", str(seed)]
-    command = [sys.executable, "-m", "deploy.local", *run, "--panel", "off"]
-    limit = ["--minutes", str(config.minutes), *shlex.split(config.more)]
+    flags = ["--seed", str(seed), "--evaluator.keep-policies", "true", *shlex.split(config.more)]
+    run = ["--run", name, *flags, "--minutes", str(config.minutes)]
+    if folder.config.exists() and resumes:
+        check(Wanted(name, tuple(flags)), folder)
+        run = ["--run", name, "--resume"]
+    elif folder.config.exists():
+        set_aside(folder)
     started = time.monotonic()
-    seen = len(whole_rows(folder.evaluations)) if is_there else 0
     curve: list[dict[str, Any]] = []
-    passage, asked = None, 0
+    passage = None
     training = subprocess.Popen(
-        [*command, *([] if is_there else limit)],
+        [sys.executable, "-m", "deploy.local", *run, "--panel", "off"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,  # a Ctrl-C in the terminal reaches it once, from here
     )
-    passed: list[Path] = []
+
+    def policy_of(row: Mapping[str, Any]) -> Path:
+        return folder.evaluated_policy(int(row["version"]))
 
     def is_confirmed(row: Mapping[str, Any]) -> bool:
-        policy = kept(folder, row)
-        if policy is None or not goal.is_met(measure(policy, CONFIRMING_SEED)):
-            return False
-        passed.append(policy)
-        return True
+        return not stop.is_set() and goal.is_met(measure(policy_of(row), CONFIRMING_SEED))
 
     with training as process:
         try:
-            while process.poll() is None and passage is None and not stop.is_set():
-                for written in whole_rows(folder.evaluations)[seen + len(curve) :]:
-                    row: dict[str, Any] = dict(written)
+            is_running = True
+            while is_running and passage is None and not stop.is_set():
+                is_running = process.poll() is None  # asked first: the last rows are looked at too
+                new: list[dict[str, Any]] = [
+                    dict(row) for row in whole_rows(folder.evaluations)[len(curve) :]
+                ]
+                for row in new:
                     row["minutes"] = round((time.monotonic() - started) / 60.0, 2)
-                    curve.append(row)
                     shown = "  ".join(f"{key} {row[key]}" for key in CURVE)
                     print(f"seed {seed}  {shown}", file=sys.stderr, flush=True)
-                passage = first_passage(curve, asked, goal, is_confirmed)
-                asked = len(curve)
-                time.sleep(LOOK_S)
+                curve += new
+                passage = first_passage(new, goal, is_confirmed)
+                stop.wait(LOOK_S)
         finally:
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
                 process.wait(PATIENCE_S)
-    if not curve or (passage is None and training.returncode and not stop.is_set()):
+    if passage is None and stop.is_set():
+        return None
+    if not curve or (passage is None and training.returncode):
         what = "was not evaluated" if not curve else f"ended with {training.returncode}"
         raise ReportedError(f"training {name} {what}: see {folder.logs}")
-    reported = measure(passed[0] if passed else folder.best_policy, REPORTED_SEED)
+    reported = measure(policy_of(passage) if passage else folder.best_policy, REPORTED_SEED)
     _write(curve, folder.report / "time_to_quality.csv")
     at = passage or curve[-1]
     return {
@@ -229,8 +204,19 @@ def train(
     }
 
 
-def measured(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dict[str, Any]:
-    """Return the figures of a run that was measured before, or train and measure it."""
+def set_aside(folder: RunFolder) -> None:
+    """Rename a run's folder: NAME-aside-1, or the next free number."""
+    free = next(
+        path
+        for n in count(1)
+        if not (path := folder.root.with_name(f"{folder.root.name}-aside-{n}")).exists()
+    )
+    folder.root.rename(free)
+    print(f"{folder.root} was stopped, or has other settings: moved to {free}", file=sys.stderr, flush=True)
+
+
+def measured(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> dict[str, Any] | None:
+    """Return the figures of a run that was measured before, or train and measure it; None if it was stopped."""
     file = RunFolder.of(name).report / "time_to_quality.json"
     asked = config.model_dump(mode="json", include={"minutes", "return_rate", "target_error", "more"})
     if file.is_file():
@@ -238,10 +224,10 @@ def measured(config: TimeToQualityConfig, name: str, seed: int, stop: Event) -> 
         if known["asked"] == asked:
             found: dict[str, Any] = known["found"]
             return found
-    found = train(config, name, seed, stop)
-    if found["reached"] or not stop.is_set():
-        write_whole(file, json.dumps({"asked": asked, "found": found}) + "\n")
-    return found
+    trained = train(config, name, seed, stop)
+    if trained is not None:
+        write_whole(file, json.dumps({"asked": asked, "found": trained}) + "\n")
+    return trained
 
 
 def _write(curve: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -263,12 +249,13 @@ def main(config: TimeToQualityConfig, stop: Event) -> int:
     base = config.run or time.strftime("quality-%Y%m%d-%H%M%S")
     runs: list[dict[str, Any]] = []
     for seed in range(config.seeds):
-        if stop.is_set():
-            break
-        runs.append(measured(config, f"{base}-{seed}", seed, stop))
+        found = None if stop.is_set() else measured(config, f"{base}-{seed}", seed, stop)
+        if found is None:
+            break  # a seed that was stopped says nothing
+        runs.append(found)
         print("  ".join(f"{key} {value}" for key, value in runs[-1].items()), file=sys.stderr, flush=True)
     if not runs:
-        raise ReportedError("stopped before the first seed")
+        raise ReportedError("stopped before the first seed had ended")
     result = {
         "goal_return_rate": config.return_rate,
         "goal_target_error": config.target_error,

@@ -36,6 +36,7 @@ class Point(BaseModel):
     dataset: int = Field(gt=0, description="frames of a dataset")
     minibatch: int = Field(gt=0, description="frames of a minibatch")
     frames: int | None = Field(gt=0, description="frames to the goal; null: it was not reached")
+    limit: int = Field(gt=0, description="frames after which it would have missed the goal")
     seed: int = Field(ge=0)
     more: str = Field("", description="flags of its training besides those of the dataset's size")
 
@@ -86,7 +87,7 @@ def read(file: Path) -> LargeBatches | None:
         raise ReportedError(
             f"{file}: {fault}; allowed: "
             '{"return_rate": 0.81, "target_error": 0.31, "points": [{"dataset": 8192, "minibatch": 2048, '
-            '"frames": 9000000, "seed": 0}]}'
+            '"frames": 9000000, "limit": 60000000, "seed": 0}]}'
         ) from None
 
 

@@ -86,6 +86,10 @@ class RunFolder:
         """The best policy by evaluation."""
         return self.root / "policy" / "best"
 
+    def evaluated_policy(self, version: int) -> Path:
+        """The policy of one evaluation, where all are kept."""
+        return self.root / "policy" / "evaluated" / f"{version:08d}"
+
     @property
     def logs(self) -> Path:
         """One log a process."""

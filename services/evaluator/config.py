@@ -24,6 +24,10 @@ class EvaluatorOptions(BaseModel):
     interval_s: float = Field(
         45.0, gt=0, description="time between evaluations", json_schema_extra={"unit": "s"}
     )
+    keep_policies: bool = Field(
+        False,
+        description="keep every evaluated policy in policy/evaluated/VERSION, 0.5 MB each, and not the best alone",
+    )
     niceness: int = Field(
         10, ge=0, le=19, description="niceness of the process, so that learner and actors have priority"
     )
@@ -37,7 +41,7 @@ class EvaluatorConfig(ServiceConfig, EvaluatorOptions):
 
     often: ClassVar = {
         "The run": ("run", "endpoint", "metrics_port"),
-        "Evaluations": ("rallies", "interval_s", "envs", "niceness"),
+        "Evaluations": ("rallies", "interval_s", "keep_policies", "envs", "niceness"),
         "The task": ("task.launch", "task.randomization", "seed"),
     }
 

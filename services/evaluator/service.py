@@ -3,6 +3,8 @@
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
@@ -176,15 +178,25 @@ class EvaluatorService:
         played = play_match(policy, self._rallies, self._task, config.envs, self._on_tick)
         found, robot = measures(played), robot_part(played.robot, self._task.robot)
         self.evaluations += 1
-        self._report(snapshot, found, self._clock() - started)
+        seconds = self._clock() - started
+        measured = contract.model_copy(update={"measures": found | robot | {"match": match_of(config)}})
+        policy = replace(policy, contract=measured)
+        if config.keep_policies:  # before its row: whoever reads the curve finds the policy
+            self._save(policy, self._folder.evaluated_policy(snapshot.version))
+        self._report(snapshot, found, seconds)
         reached = score(snapshot.stage, found)
-        if self._best is None or reached > self._best:
-            measured = contract.model_copy(update={"measures": found | robot | {"match": match_of(config)}})
-            try:
-                save_policy(self._folder.best_policy, policy.network, policy.moments, measured)
-                self._best = reached
-            except OSError as error:
-                log.error("can't write policy=%s reason=%s", self._folder.best_policy, error.strerror)
+        is_better = self._best is None or reached > self._best
+        if is_better and self._save(policy, self._folder.best_policy):
+            self._best = reached
+
+    def _save(self, policy: Policy, folder: Path) -> bool:
+        """Write a policy, and return whether that succeeded: on a full disk the evaluations go on."""
+        try:
+            save_policy(folder, policy.network, policy.moments, policy.contract)
+        except OSError as error:
+            log.error("can't write policy=%s reason=%s", folder, error.strerror)
+            return False
+        return True
 
     def _report(self, snapshot: PolicySnapshot, found: dict[str, Any], seconds: float) -> None:
         """Write an evaluation to log, curve, heartbeat and metrics."""

@@ -32,9 +32,32 @@ def test_a_size_that_is_no_whole_number_of_rollouts_is_refused(size):
 
 def test_all_sizes_have_their_first_seed_before_one_has_its_second():
     config = BatchSizesConfig(sizes=(8192, 32_768), seeds=(3, 4))
-    points = (Point(dataset=32_768, minibatch=2048, frames=None, seed=3),)
+    points = (Point(dataset=32_768, minibatch=8192, frames=None, limit=60_000_000, seed=3),)
 
     assert missing(config, points) == [(8192, 3), (8192, 4), (32_768, 4)]
+
+
+@pytest.mark.parametrize(
+    ("known", "is_done"),
+    [
+        ({"frames": 9_000_000, "limit": 20_000_000}, True),
+        ({"frames": None, "limit": 60_000_000}, True),
+        ({"frames": None, "limit": 20_000_000}, False),  # it may reach the goal with more
+        ({"frames": 9_000_000, "limit": 60_000_000, "minibatch": 512}, False),
+        ({"frames": 9_000_000, "limit": 60_000_000, "more": "--seed 7"}, False),
+    ],
+)
+def test_only_a_training_of_the_same_rule_and_at_least_as_many_frames_is_known(known, is_done):
+    config = BatchSizesConfig(sizes=(8192,), seeds=(0,))
+    point = Point(**({"dataset": 8192, "minibatch": 2048, "seed": 0} | known))
+
+    assert (missing(config, (point,)) == []) is is_done
+
+
+@pytest.mark.parametrize("other", [{"minibatch": 512}, {"more": "--actor.horizon 64"}])
+def test_another_rule_needs_a_file_of_its_own(other):
+    with pytest.raises(ReportedError, match="allowed: another file, since this one is of one rule"):
+        main(BatchSizesConfig(**other, train=False), Event())
 
 
 def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, monkeypatch, capsys):
@@ -45,6 +68,7 @@ def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, mon
         asked.append((name, seed, config.more))
         if len(asked) == 3:
             stopped.set()  # Ctrl-C in the third
+            return None
         return {"reached": len(asked) == 1, "frames": 9_000_000}
 
     monkeypatch.setattr(batch_sizes, "train", train)
@@ -66,8 +90,8 @@ def test_each_training_is_written_at_once_and_is_not_trained_again(tmp_path, mon
         == "--actors 2 --actor.envs 128 --actor.horizon 32 --learner.ppo.minibatch 2048 --frames 20000000"
     )
     assert first == (
-        Point(dataset=8192, minibatch=2048, frames=9_000_000, seed=0),
-        Point(dataset=32_768, minibatch=8192, frames=None, seed=0),  # it trained to its end
+        Point(dataset=8192, minibatch=2048, frames=9_000_000, limit=20_000_000, seed=0),
+        Point(dataset=32_768, minibatch=8192, frames=None, limit=20_000_000, seed=0),  # it trained to its end
     )
     assert len(read(config.out).points) == 4
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -9,13 +9,19 @@ from common.errors import ReportedError
 SIZES = (4096, 8192, 32768, 131072, 524288)
 FILE = (
     '{"return_rate": 0.81, "target_error": 0.31, '
-    '"points": [{"dataset": 8192, "minibatch": 2048, "frames": %s, "seed": 0}]}'
+    '"points": [{"dataset": 8192, "minibatch": 2048, "frames": %s, "limit": 60000000, "seed": 0}]}'
 )
 
 
 def points_of(least, noise, factors=(1.0,)):
     return [
-        Point(dataset=size, minibatch=2048, frames=round(factor * least * (1 + size / noise)), seed=seed)
+        Point(
+            dataset=size,
+            minibatch=2048,
+            frames=round(factor * least * (1 + size / noise)),
+            limit=60_000_000,
+            seed=seed,
+        )
         for size in SIZES
         for seed, factor in enumerate(factors)
     ]
@@ -46,7 +52,9 @@ def test_twice_the_noise_size_needs_three_times_the_least_frames():
 
 
 def test_frames_that_do_not_grow_give_a_noise_size_far_above_the_datasets():
-    law = fit([Point(dataset=size, minibatch=2048, frames=9_000_000, seed=0) for size in SIZES])
+    law = fit(
+        [Point(dataset=size, minibatch=2048, frames=9_000_000, limit=60_000_000, seed=0) for size in SIZES]
+    )
 
     assert law.noise > 100 * max(SIZES)
     assert law.frames(max(SIZES)) == pytest.approx(9e6, rel=0.01)
@@ -54,8 +62,8 @@ def test_frames_that_do_not_grow_give_a_noise_size_far_above_the_datasets():
 
 def test_trainings_that_missed_the_goal_are_counted_and_left_out():
     missed = [
-        Point(dataset=524288, minibatch=2048, frames=None, seed=7),
-        Point(dataset=2**21, minibatch=2048, frames=None, seed=8),
+        Point(dataset=524288, minibatch=2048, frames=None, limit=60_000_000, seed=7),
+        Point(dataset=2**21, minibatch=2048, frames=None, limit=60_000_000, seed=8),
     ]
     law = fit([*points_of(8e6, 60_000.0), *missed])
 
@@ -65,7 +73,10 @@ def test_trainings_that_missed_the_goal_are_counted_and_left_out():
 
 
 def test_one_size_of_datasets_gives_no_law():
-    points = [Point(dataset=8192, minibatch=2048, frames=9_000_000, seed=seed) for seed in range(3)]
+    points = [
+        Point(dataset=8192, minibatch=2048, frames=9_000_000, limit=60_000_000, seed=seed)
+        for seed in range(3)
+    ]
 
     with pytest.raises(
         ReportedError, match=r"^trainings that reached the goal have 1 sizes of datasets; allowed: two"
@@ -81,7 +92,9 @@ def test_a_file_of_trainings_is_read(tmp_path):
     file = tmp_path / "large_batches.json"
     file.write_text(FILE % 9_000_000)
 
-    assert read(file).points == (Point(dataset=8192, minibatch=2048, frames=9_000_000, seed=0),)
+    assert read(file).points == (
+        Point(dataset=8192, minibatch=2048, frames=9_000_000, limit=60_000_000, seed=0),
+    )
 
 
 @pytest.mark.parametrize(

@@ -188,7 +188,13 @@ def test_without_measured_trainings_there_are_rates_and_bounds_and_no_minutes(co
 
 def test_with_measured_trainings_there_are_minutes(costs_file, tmp_path, capsys):
     points = [
-        {"dataset": d, "minibatch": d // 4, "frames": round(8e6 * (1 + d / 60_000)), "seed": 0}
+        {
+            "dataset": d,
+            "minibatch": d // 4,
+            "frames": round(8e6 * (1 + d / 60_000)),
+            "limit": 10**9,
+            "seed": 0,
+        }
         for d in (4096, 131_072)
     ]
     file = tmp_path / "points.json"
