@@ -5,9 +5,9 @@
 Hu et al. compare the curriculum with stage 3 alone, and their collision equations with the simulator's own contacts.
 All three arms here are the default method without what acts in stage 3 alone: hit corrections with the way home, the
 bonus for the predicted landing, and the bound of the action noise that corrections need. Stages have the authors'
-shares of the frames. The last weights of each run play the same 2,000 balls, with the measured bounces. Differences
-are taken seed by seed. Trainings are made once (``benchmarks.trainings``), and the program goes on where it was
-stopped.
+shares of the frames. The last weights of each run play the same 2,000 balls with the measured bounces, whatever
+contacts they were trained with. Differences are taken seed by seed. Trainings are made once (``benchmarks.trainings``),
+and the program goes on where it was stopped.
 """
 
 import json
@@ -22,8 +22,9 @@ from pydantic import Field
 
 from benchmarks.recipe import MEASURES, medians, result
 from benchmarks.settings import BenchmarkConfig, as_flags, run
-from benchmarks.trainings import Wanted, made, make
+from benchmarks.trainings import Wanted, examined, finished, make
 from common.service.process import DONE, FAILED
+from common.service.run_folder import RunFolder
 from topspin.report.paired import over_seeds
 
 BASE: Final[dict[str, str]] = {
@@ -41,6 +42,8 @@ ARMS: Final[dict[str, dict[str, str]]] = {
     "simulator's contacts": {"task.collision": "original"},
 }
 """Flags of each arm besides."""
+BOUNCES: Final = "tailored"  # the measured ones
+EXAM: Final = "measured_bounces"  # report/EXAM.json of a run with other contacts
 
 
 class AblationConfig(BenchmarkConfig):
@@ -51,7 +54,9 @@ class AblationConfig(BenchmarkConfig):
     )
     seeds: tuple[int, ...] = Field((0, 1, 2), description="seeds of each arm: 0,1,2")
     run: str = Field("ablation", min_length=1, description="name of the runs, before -ARM-SEED")
-    more: tuple[str, ...] = Field((), description="more flags of topspin train, the same for all: --actors,2")
+    more: tuple[str, ...] = Field(
+        (), description='more flags of topspin train, the same for all, as JSON: \'["--actors", "1"]\''
+    )
     train: bool = Field(True, description="false: print what is there")
 
 
@@ -65,9 +70,19 @@ def wanted(config: AblationConfig, arm: str, seed: int) -> Wanted:
 def figures(config: AblationConfig) -> dict[str, list[dict[str, Any]]]:
     """Return the measures of the runs of each arm that have ended."""
     return {
-        arm: [result(folder) for seed in config.seeds if (folder := made(wanted(config, arm, seed)))]
+        arm: [measured(folder) for folder in finished(wanted(config, arm, seed) for seed in config.seeds)]
         for arm in ARMS
     }
+
+
+def measured(folder: RunFolder) -> dict[str, Any]:
+    """Return the measures of a run's last weights with the measured bounces."""
+    own = result(folder)
+    if own["collision"] == BOUNCES:
+        return own
+    flags = {"collision": BOUNCES, "rallies": BASE["final-rallies"], "seed": own["seed"]}
+    exam = examined(folder, EXAM, as_flags(flags))
+    return own | {key: exam[key] for key in (*MEASURES, "collision")}
 
 
 def differences(arms: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
@@ -90,7 +105,7 @@ def main(config: AblationConfig, stop: Event) -> int:
     """Train what is missing, and print measures and differences."""
     # The first seed of all arms, then the next: what is there after a stop can be compared
     asked = [wanted(config, arm, seed) for seed in config.seeds for arm in ARMS]
-    faults = make(asked, stop) if config.train else []
+    faults = make(asked, stop, config.train)
     arms = figures(config)
     apart = differences(arms)
     if config.json_line:

@@ -17,7 +17,7 @@ from pydantic import Field
 
 from benchmarks.recipe import MEASURES, medians, result
 from benchmarks.settings import BenchmarkConfig, as_flags, run
-from benchmarks.trainings import Wanted, made, make
+from benchmarks.trainings import Wanted, finished, make
 from common.errors import ReportedError
 from common.service.process import DONE, FAILED
 
@@ -128,8 +128,7 @@ def figures(config: LadderConfig) -> list[dict[str, Any]]:
     """Return what the runs of each rung reached; rungs without a measured run are left out."""
     found = []
     for rung, one in enumerate(RUNGS):
-        folders = [made(wanted(config, rung, seed)) for seed in config.seeds]
-        runs = [result(folder) for folder in folders if folder]
+        runs = [result(one) for one in finished(wanted(config, rung, seed) for seed in config.seeds)]
         if runs:
             found.append({"rung": rung, "name": one.name, "runs": runs, "median": medians(runs)})
     return found
@@ -142,7 +141,7 @@ def main(config: LadderConfig, stop: Event) -> int:
         raise ReportedError(f"no rung {wrong[0]}; allowed: 0 to {len(RUNGS) - 1}")
     # The first seed of all rungs, then the next: what is there after a stop says something about each
     asked = [wanted(config, rung, seed) for seed in config.seeds for rung in rungs]
-    faults = make(asked, stop) if config.train else []
+    faults = make(asked, stop, config.train)
     found = figures(config)
     if config.json_line:
         print(json.dumps({"frames": config.frames, "ladder": found}))

@@ -83,7 +83,7 @@ def label(settings: Mapping[str, Any], known: Mapping[str, Mapping[str, Any]]) -
 
 
 def result(folder: RunFolder) -> dict[str, Any]:
-    """Return the measures of a finished run's last weights.
+    """Return the measures of a finished run's last weights, under the contacts of its training.
 
     Raises:
         ReportedError: It has none.
@@ -108,6 +108,7 @@ def result(folder: RunFolder) -> dict[str, Any]:
         "frames": int(float(found["frames"])),
         **{key: _number(found.get(key)) for key in MEASURES},
         "measured": measured,
+        "collision": found.get("collision"),
     }
 
 

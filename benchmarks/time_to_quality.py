@@ -30,7 +30,7 @@ from typing import Any, Final, NamedTuple
 from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, as_flags, run
-from benchmarks.trainings import Wanted, check
+from benchmarks.trainings import Wanted, check, evaluated
 from common.errors import ReportedError
 from common.policy.folder import load_policy
 from common.service.run_folder import RunFolder
@@ -114,18 +114,7 @@ def match_flags(policy: Path) -> list[str]:
 
 def measure(policy: Path, seed: int) -> dict[str, Any]:
     """Return a policy's measures on rallies of ``seed``, under the conditions of its training."""
-    flags = ["--policy", str(policy), "--rallies", str(RALLIES), "--seed", str(seed), *match_flags(policy)]
-    done = subprocess.run(
-        [sys.executable, "-m", "topspin", "evaluate", *flags, "--json"],
-        capture_output=True,
-        text=True,
-        check=False,
-        start_new_session=True,  # a Ctrl-C ends the benchmark, which then waits for it
-    )
-    if done.returncode:
-        raise ReportedError(f"measuring {policy} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+    return evaluated(policy, ["--rallies", str(RALLIES), "--seed", str(seed), *match_flags(policy)])
 
 
 def train(

@@ -1,7 +1,8 @@
 """Trainings that a study needs: each is made once, goes on where it was stopped, and leaves what its table needs.
 
 A training is the run runs/NAME. Of one that ended, settings, curve and the measures of its last policy are copied to
-benchmarks/results/runs/NAME, which a clone of the repository has. Whatever is in either folder is not trained again.
+benchmarks/results/runs/NAME, which a clone of the repository has. Whatever is in either folder is not trained again,
+and measures under other conditions than the training's own (``examined``) are not made again.
 """
 
 import json
@@ -9,7 +10,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -18,6 +20,7 @@ from common.errors import ReportedError
 from common.service.config import to_tables
 from common.service.config_sources import read_toml
 from common.service.run_folder import RunFolder
+from common.service.whole_file import write_whole
 from deploy.config import SECTION, settings
 from topspin.report.groups import experiment
 
@@ -90,14 +93,80 @@ def _text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value) if value != "" else "empty"
 
 
-def make(wanted: Sequence[Wanted], stop: Event) -> list[str]:
-    """Train what is missing, one after the other, and return in words what failed."""
+def make(wanted: Iterable[Wanted], stop: Event, trains: bool = True) -> list[str]:
+    """Train what is missing, one after the other, and return in words what failed.
+
+    Args:
+        wanted: The trainings.
+        stop: Ends them.
+        trains: False: only say which runs are other trainings than their names promise.
+    """
     faults = []
     for one in wanted:
-        if not stop.is_set() and (fault := _train(one, stop)):
+        if stop.is_set():
+            break
+        try:
+            made(one)
+            fault = _train(one, stop) if trains else ""
+        except ReportedError as error:  # the others are made all the same
+            fault = str(error)
+        if fault:
             print(fault, file=sys.stderr, flush=True)
             faults.append(fault)
     return faults
+
+
+def finished(wanted: Iterable[Wanted]) -> list[RunFolder]:
+    """Return the folders of the trainings that have ended, without runs that are other trainings."""
+    found = []
+    for one in wanted:
+        with suppress(ReportedError):  # ``make`` has said so
+            if folder := made(one):
+                found.append(folder)
+    return found
+
+
+def examined(folder: RunFolder, name: str, flags: Sequence[str]) -> dict[str, Any]:
+    """Return the measures of a run's last policy under other conditions; they are kept as report/NAME.json.
+
+    Args:
+        folder: Of a run that has ended, or what is kept of it.
+        name: Of the conditions.
+        flags: Of ``topspin evaluate``.
+
+    Raises:
+        ReportedError: Only a copy without its policy is here and was not measured, or the evaluation failed.
+    """
+    file = folder.report / f"{name}.json"
+    if not file.is_file():
+        if not folder.latest_policy.is_dir():
+            raise ReportedError(f"{folder.root} has neither {file.name} nor its policy; train it again")
+        measures = evaluated(folder.latest_policy, flags)
+        text = json.dumps({key: value for key, value in measures.items() if not isinstance(value, dict)})
+        for report in (folder.report, RunFolder(KEPT / folder.root.name).report):
+            if report.is_dir():
+                write_whole(report / file.name, text + "\n")
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
+
+
+def evaluated(policy: Path, flags: Sequence[str]) -> dict[str, Any]:
+    """Return what ``topspin evaluate`` measures.
+
+    Raises:
+        ReportedError: It failed.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "topspin", "evaluate", "--policy", str(policy), *flags, "--json"],
+        capture_output=True,
+        text=True,
+        check=False,
+        start_new_session=True,  # a Ctrl-C ends the benchmark, which then waits for it
+    )
+    if done.returncode:
+        raise ReportedError(f"measuring {policy} ended with {done.returncode}: {done.stderr.strip()[-300:]}")
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
 
 
 def _train(wanted: Wanted, stop: Event) -> str:

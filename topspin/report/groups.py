@@ -12,12 +12,13 @@ from topspin.report.collect import Run
 BOOKKEEPING: Final = frozenset(
     {
         *("run", "recipe", "seed", "minutes", "frames", "panel", "evaluate", "final_rallies", "metrics_port"),
-        *("silence_warning_s", "checkpoint_interval_s", "writers", "device"),
+        *("silence_warning_s", "checkpoint_interval_s", "writers", "device", "watchdog_s"),
+        *("learner.history", "actor.history"),  # task.observation.history is another thing
         *("endpoint", "peers", "connect_timeout_s", "lease_s", "max_message_mib"),
         *("tls", "metrics_host", "log_level", "status_interval_s"),
     }
 )
-"""Settings that name, monitor or connect a run: they do not distinguish experiments."""
+"""Settings that name, monitor or connect a run, by name or path: they do not distinguish experiments."""
 
 EVALUATOR: Final = "evaluator"  # measures a run without changing it
 
@@ -52,7 +53,7 @@ def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
     found = {
         path: value
         for path, value in leaves(settings)
-        if path.split(".")[0] != EVALUATOR and path.split(".")[-1] not in BOOKKEEPING
+        if path.split(".")[0] != EVALUATOR and not BOOKKEEPING & {path, path.split(".")[-1]}
     }
     if "actors" in found and not found.get("learner.intake.dataset_rollouts"):
         actors = found.pop("actors")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from threading import Event
 
 import pytest
@@ -12,6 +13,7 @@ from benchmarks.trainings import Wanted, is_measured, keep, made, make
 from benchmarks.trainings import differences as settings_apart
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
+from common.service.process import FAILED
 from common.service.run_folder import RunFolder
 from deploy.config import settings
 from topspin.report.groups import experiment
@@ -51,12 +53,12 @@ def test_no_arm_has_what_acts_in_stage_3_alone():
         assert found["learner.curriculum.aiming_log_std"] == 1.0
 
 
-def finished(training: Wanted, returned, balls=2000):
+def finished(training: Wanted, returned, balls=2000, collision="tailored"):
     folder = RunFolder.of(training.name)
     folder.create()
     save_settings(folder.config, to_tables(settings(("--run", training.name, *training.flags), "p"), "local"))
     rates = {"return_rate": returned, "return_after_catch": returned, "target_error_mean": None}
-    measured = rates | {"frames": 7, "rallies": balls}
+    measured = rates | {"frames": 7, "rallies": balls, "collision": collision}
     folder.final.write_text(json.dumps(measured))
     folder.checkpoints.joinpath("large").write_text("x")
     return folder
@@ -78,6 +80,56 @@ def test_differences_are_students_of_the_seeds_that_both_arms_have(capsys):
     assert (apart["low"], apart["high"]) == pytest.approx((0.1333 - half, 0.1333 + half), abs=2e-4)
     assert found["arms"]["curriculum"]["median"]["return_rate"] == 0.6
     assert found["arms"]["simulator's contacts"]["runs"] == []
+
+
+def test_a_policy_of_other_contacts_is_measured_with_the_measured_bounces_once(monkeypatch, capsys):
+    config = AblationConfig(train=False, json_line=True, seeds=(3,))
+    finished(wanted(config, "curriculum", 3), 0.7)
+    folder = finished(wanted(config, "simulator's contacts", 3), 0.9, collision="original")
+    keep(folder, trainings.KEPT)
+    folder.latest_policy.mkdir(parents=True)
+    evaluations = []
+
+    def evaluated(policy, flags):
+        evaluations.append(flags)
+        return {
+            "return_rate": 0.5,
+            "return_after_catch": 0.6,
+            "target_error_mean": 0.4,
+            "collision": "tailored",
+        }
+
+    monkeypatch.setattr(trainings, "evaluated", evaluated)
+    returned = []
+    for _ in range(2):
+        main(config, Event())
+        arms = json.loads(capsys.readouterr().out)["arms"]
+        returned.append(
+            [arms[arm]["runs"][0]["return_rate"] for arm in ("curriculum", "simulator's contacts")]
+        )
+    shutil.rmtree(folder.root)  # as in a clone
+    main(config, Event())
+
+    assert returned == [[0.7, 0.5]] * 2
+    assert (
+        json.loads(capsys.readouterr().out)["arms"]["simulator's contacts"]["runs"][0]["return_rate"] == 0.5
+    )
+    assert evaluations == [["--collision", "tailored", "--rallies", "2000", "--seed", "3"]]
+
+
+def test_a_run_that_is_another_training_does_not_end_the_study(monkeypatch, capsys):
+    config = AblationConfig(json_line=True, seeds=(0,))
+    finished(wanted(config, "curriculum", 0), 0.7, balls=100)
+    started = []
+    monkeypatch.setattr(trainings, "_train", lambda one, stop: (made(one) and started.append(one.name)) or "")
+    finished(wanted(config, "stage 3 alone", 0), 0.6)
+
+    assert main(config, Event()) == FAILED
+    told = capsys.readouterr()
+    assert started == ["ablation-stage-3-alone-0"]
+    assert told.err.count("final_rallies 100; choose another --run") == 1
+    assert json.loads(told.out)["arms"]["curriculum"]["runs"] == []
+    assert json.loads(told.out)["arms"]["stage 3 alone"]["median"]["return_rate"] == 0.6
 
 
 def test_one_seed_has_no_difference():

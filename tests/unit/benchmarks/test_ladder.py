@@ -1,6 +1,7 @@
 """The ladder's rungs, and what it prints of finished runs."""
 
 import json
+import re
 from threading import Event
 
 import pytest
@@ -11,6 +12,7 @@ from benchmarks.recipe import known_settings
 from benchmarks.trainings import differences, is_measured
 from common.errors import ReportedError
 from common.service.config import save_settings, to_tables
+from common.service.process import FAILED
 from common.service.run_folder import RunFolder
 from deploy.config import settings
 from topspin.report.groups import experiment
@@ -55,17 +57,17 @@ def save_run(folder, rung, seed, *more):
         (3, ("--learner.ppo.clip", "0.1"), "learner.ppo.clip 0.1"),
     ],
 )
-def test_a_run_of_other_settings_is_not_taken_for_a_rung(tmp_path, monkeypatch, rung, more, said):
+def test_a_run_of_other_settings_is_not_taken_for_a_rung(tmp_path, monkeypatch, capsys, rung, more, said):
     monkeypatch.chdir(tmp_path)
     folder = RunFolder.of("ladder-3-1")
     folder.create()
     save_run(folder, rung, 1, *more)
     folder.final.write_text(json.dumps({"return_rate": 0.5, "rallies": 1000}))
 
-    with pytest.raises(
-        ReportedError, match=f"is not the training that is wanted: it has .*{said}.*; choose another --run"
-    ):
-        main(LadderConfig(train=False), Event())
+    assert main(LadderConfig(train=False, json_line=True), Event()) == FAILED
+    told = capsys.readouterr()
+    assert re.search(f"is not the training that is wanted: it has .*{said}.*; choose another --run", told.err)
+    assert json.loads(told.out)["ladder"] == []
 
 
 def test_the_number_of_actors_does_not_make_another_rung(tmp_path, monkeypatch, capsys):

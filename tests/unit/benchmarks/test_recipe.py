@@ -72,6 +72,7 @@ def test_runs_of_the_recipe_are_one_rung_whatever_their_seed_and_length():
             "return_after_catch",
             "target_error_mean",
             "measured",
+            "collision",
         )
     }
     assert [rung["label"] for rung in found["ladder"]] == ["paper"]
@@ -131,6 +132,7 @@ def test_a_run_that_was_not_measured_at_its_end_has_its_last_evaluation():
         "return_after_catch": 0.5,
         "target_error_mean": None,
         "measured": "last evaluation",
+        "collision": None,  # an evaluation does not say
     }
 
 
@@ -142,7 +144,7 @@ def test_a_run_without_measures_is_named():
 def test_a_setting_that_the_run_lacks_is_a_difference():
     known = known_settings()
 
-    assert label({}, known).startswith("paper with actor.history unset, actor.horizon unset")
+    assert label({}, known).startswith("paper with actor.horizon unset, actor.outbox.give_up_s unset")
 
 
 def test_the_line_is_json(capsys):
