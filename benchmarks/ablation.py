@@ -55,7 +55,8 @@ class AblationConfig(BenchmarkConfig):
     seeds: tuple[int, ...] = Field((0, 1, 2), description="seeds of each arm: 0,1,2")
     run: str = Field("ablation", min_length=1, description="name of the runs, before -ARM-SEED")
     more: tuple[str, ...] = Field(
-        (), description='more flags of topspin train, the same for all, as JSON: \'["--actors", "1"]\''
+        (),
+        description='more flags of topspin train, the same for all, as JSON: ["--actors", "1"]',
     )
     train: bool = Field(True, description="false: print what is there")
 
