@@ -73,12 +73,14 @@ def watch(
             closing(TargetsFile(run.folder.targets, run.name, run.config.metrics_host))
         )
         run.folder.wanted_actors.unlink(missing_ok=True)  # of an earlier life
+        # The supervisor has a group of learners as one child
+        followers = [f"learner-{rank}" for rank in range(1, run.config.learners)]
         while not stop.is_set() and not supervisor.has_ended(LEARNER):
             now = time.monotonic()
             supervisor.watch(now)
             scale(run, view, supervisor)
             watcher.look(now)
-            targets.update(view.statuses.values(), supervisor.children)
+            targets.update(view.statuses.values(), [*supervisor.children, *followers])
             end_hung(watchdog, supervisor, view, now)
             view.restarts = {name: child.restarts for name, child in supervisor.children.items()}
             if name := supervisor.has_bad_config():

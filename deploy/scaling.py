@@ -24,6 +24,10 @@ def ask(folder: RunFolder, actors: int) -> None:
     try:
         folder.check_free_of("deploy.local")
     except RunAliveError:
+        if not folder.targets.is_file():  # it is there while somebody reads what is asked for
+            raise ReportedError(
+                f"the run {folder.root} is starting or ending; allowed: a run that trains, so ask again soon"
+            ) from None
         write_whole(folder.wanted_actors, f"{actors}\n")
         return
     raise ReportedError(

@@ -8,7 +8,9 @@ from typing import Final, Literal
 
 WAIT_SHARE: Final = "topspin_learner_wait_share"
 """Name of the learner's hunger, which a rule records, and by which actors can be scaled."""
-WAIT_SHARE_QUERY: Final = '1 - rate(topspin_phase_seconds_total{role="learner",phase="update"}[2m])'
+LEADER: Final = 'role="learner",id="0"'
+"""Labels of the learner that leads: of a group, it counts the frames of all."""
+WAIT_SHARE_QUERY: Final = f'1 - rate(topspin_phase_seconds_total{{{LEADER},phase="update"}}[2m])'
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,7 @@ ALARMS: Final = (
     ),
     Alarm(
         "TopspinNotTraining",
-        'rate(topspin_frames_total{role="learner"}[5m])',
+        f"rate(topspin_frames_total{{{LEADER}}}[5m])",
         "== 0",
         "5m",
         "critical",

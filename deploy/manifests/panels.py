@@ -5,6 +5,7 @@ from itertools import count
 from typing import Any, Final
 
 from common.service.metric_table import METRICS
+from deploy.manifests.alarms import LEADER
 
 RUN: Final = '{run="$run"}'
 COLUMNS: Final = 24  # of Grafana's grid
@@ -38,7 +39,8 @@ class Row:
 
 
 def _by(metric: str, role: str, more: str = "") -> str:
-    return f'{metric}{{run="$run",role="{role}"{more}}}'
+    who = LEADER if role == "learner" else f'role="{role}"'
+    return f'{metric}{{run="$run",{who}{more}}}'
 
 
 _SERVICE: Final = "{{role}}-{{id}}"

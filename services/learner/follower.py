@@ -97,7 +97,9 @@ class FollowerService:
         )
         if is_complete:
             self._member.state = "training"
+            started = self._clock()
             stats = self.training.run_epoch([entry.rollout for entry in in_order(dataset)], self._serve)
+            telemetry.measure_update(self._metrics, self._clock() - started)
             if stats.diverged:
                 self._go_back()
             lost = self._intake.finish_update(self._learner_state())

@@ -6,8 +6,9 @@ So a hundred actors are a hundred equal processes, such as the replicas of one D
 import logging
 import re
 from collections.abc import Set
+from itertools import count
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import tomli_w
 
@@ -30,32 +31,58 @@ ANSWERED_AT_ONCE: Final = 16
 _NUMBER: Final = re.compile(r"[0-9]{1,6}$")
 
 
+class Held(NamedTuple):
+    """A number that was given."""
+
+    number: int
+    end: float  # [s] by then its actor has shown its token, or the number is free again
+
+
 class Places:
-    """The numbers that are given and not used yet."""
+    """The numbers of the actors: two that live never have the same one, since it decides their balls and their noise.
+
+    A learner that was restarted knows the numbers of names that end with theirs.
+    """
 
     def __init__(self) -> None:
-        self._held: dict[int, float] = {}  # end of each one's time [s], the soonest first
+        self._given: dict[str, Held] = {}  # by the actor's name, the oldest first
 
     def give(self, name: str, present: Set[str], now: float) -> tuple[str, int]:
-        """Return name and number for an actor that joins at ``now`` [s]: the lowest number that is free.
+        """Return name and number for an actor that joins at ``now`` [s].
+
+        It is the number at the end of its name, such as a certificate's; else, or where another actor has that one, the
+        lowest that is free. A name that joins again keeps its number.
 
         Args:
-            name: Its name, or "". A name with a number at its end, such as a certificate's, has that number.
+            name: Its name, or "".
             present: The names of the actors that live.
             now: [s]
         """
-        self._held = {number: end for number, end in self._held.items() if end > now}
-        if found := _NUMBER.search(name):
-            return name, int(found[0])
-        taken = {int(found[0]) for other in present if (found := _NUMBER.search(other))}
-        number = 0
-        while number in taken or number in self._held:
-            number += 1
-        if len(self._held) >= MOST_HELD:
-            number = next(iter(self._held))
-            del self._held[number]
-        self._held[number] = now + HELD_S
-        return name or str(number), number
+        self._given = {who: held for who, held in self._given.items() if who in present or held.end > now}
+        if name in self._given:
+            number = self._given.pop(name).number
+        else:
+            starting = [who for who in self._given if who not in present]
+            if len(starting) >= MOST_HELD:
+                del self._given[starting[0]]
+            taken = {held.number for held in self._given.values()}
+            unknown = present - self._given.keys() - {name}
+            taken |= {own for other in unknown if (own := number_in(other)) is not None}
+            wish = number_in(name)
+            number = wish if wish is not None else 0
+            if number in taken or wish is None:
+                number = next(k for k in count() if k not in taken and (name or str(k) not in present))
+            if wish not in (None, number):
+                log.warning("actor=%s gets the number %d: another actor has %d", name, number, wish)
+        name = name or str(number)
+        self._given[name] = Held(number, now + HELD_S)
+        return name, number
+
+
+def number_in(name: str) -> int | None:
+    """Return the number at the end of a name, or None."""
+    found = _NUMBER.search(name)
+    return int(found[0]) if found else None
 
 
 class Registrar:

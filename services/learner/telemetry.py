@@ -52,8 +52,7 @@ def measure_epoch(metrics: Metrics, stats: EpochStats, frames_per_s: float, upda
     play, update, progress = stats.play, stats.update, stats.progress
     metrics.inc("topspin_frames_total", stats.frames)
     metrics.inc("topspin_episodes_total", int(play.outcomes.sum()))
-    metrics.inc("topspin_phase_seconds_total", update_s, phase="update")
-    metrics.observe("topspin_update_seconds", update_s)
+    measure_update(metrics, update_s)
     for outcome in Outcome:
         if outcome is not Outcome.NONE and play.outcomes[outcome]:
             count = int(play.outcomes[outcome])
@@ -82,6 +81,12 @@ def measure_epoch(metrics: Metrics, stats: EpochStats, frames_per_s: float, upda
         metrics.set(name, value)
     for name, term in zip(TERMS, play.reward_terms, strict=True):
         metrics.set("topspin_reward_per_frame", float(term), term=name)
+
+
+def measure_update(metrics: Metrics, update_s: float) -> None:
+    """Put the duration of an update [s] into the metrics, also of a learner that does not lead."""
+    metrics.inc("topspin_phase_seconds_total", update_s, phase="update")
+    metrics.observe("topspin_update_seconds", update_s)
 
 
 FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")

@@ -36,20 +36,29 @@ def taken(ranks: Sequence[Rank], dataset: int) -> tuple[int, ...]:
     if sum(rank.queued for rank in ranks) < dataset:
         return tuple(counts)
     missing = dataset
-    while missing:  # one of each in turn, so that the work is divided as evenly as it can be
-        for number, rank in enumerate(ranks):
-            if missing and counts[number] < rank.queued:
-                counts[number] += 1
-                missing -= 1
+    # First what each has asked its actors for, so that no rollout waits for a turn that was not meant for it. Then what
+    # others lack: one of each in turn, so that the work is divided as evenly as it can be
+    for most in (parts(ranks, dataset), [rank.queued for rank in ranks]):
+        room = [min(limit, rank.queued) for limit, rank in zip(most, ranks, strict=True)]
+        while missing and counts != [max(pair) for pair in zip(counts, room, strict=True)]:
+            for number in range(len(ranks)):
+                if missing and counts[number] < room[number]:
+                    counts[number] += 1
+                    missing -= 1
     return tuple(counts)
 
 
 def parts(ranks: Sequence[Rank], dataset: int) -> tuple[int, ...]:
     """Return how many rollouts of a dataset each rank asks its actors for: by how many actors it has.
 
-    Those that bring nothing do not count. But a rank with any actor asks for one rollout: such an actor may be back.
+    They are one dataset together, by largest remainders: what is asked for beyond it waits, and grows too old. Those
+    that bring nothing do not count. But a rank with any actor asks for one rollout: such an actor may be back.
     """
     active = sum(rank.active for rank in ranks)
     if not active:
         return (-(-dataset // len(ranks)),) * len(ranks)
-    return tuple(max(-(-dataset * rank.active // active), min(rank.able, 1)) for rank in ranks)
+    counts = [dataset * rank.active // active for rank in ranks]
+    by_remainder = sorted(range(len(ranks)), key=lambda k: -(dataset * ranks[k].active % active))
+    for number in by_remainder[: dataset - sum(counts)]:
+        counts[number] += 1
+    return tuple(max(count, min(rank.able, 1)) for count, rank in zip(counts, ranks, strict=True))

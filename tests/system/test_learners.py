@@ -1,7 +1,9 @@
 """Two learners train together; when one dies the group starts again, and no rollout is unaccounted for."""
 
+import json
 import os
 import signal
+import urllib.request
 
 import psutil
 
@@ -19,6 +21,20 @@ def test_a_group_of_learners_trains_dies_and_goes_on(tmp_path):
         rows = whole_rows(folder / "metrics.csv")
         return int(rows[-1]["epoch"]) if rows else 0
 
+    def update_seconds():
+        """Return how long each learner's updates took, as its /metrics says."""
+        groups = json.loads((folder / "targets.json").read_text())
+        learners = {g["labels"]["id"]: g["targets"][0] for g in groups if g["labels"]["role"] == "learner"}
+        found = {}
+        for rank, address in learners.items():
+            with urllib.request.urlopen(f"http://{address}/metrics") as answer:
+                lines = answer.read().decode().splitlines()
+            (line,) = [
+                line for line in lines if line.startswith("topspin_phase_seconds_total") and "update" in line
+            ]
+            found[rank] = float(line.split()[-1])
+        return found
+
     def ranks(launcher):
         found = [
             child for child in launcher.children(recursive=True) if "services.learner" in child.cmdline()
@@ -33,6 +49,8 @@ def test_a_group_of_learners_trains_dies_and_goes_on(tmp_path):
         wait_until(
             lambda: trained() > 6 and list(folder.glob("checkpoints/*.safetensors")), 90, "a checkpoint"
         )
+        wait_until(lambda: update_seconds().keys() == {"0", "1"}, 30, "both learners to be watched")
+        assert all(seconds > 0.0 for seconds in update_seconds().values())
         before = ranks(psutil.Process(command.process.pid))
         assert before.keys() == {"0", "1"}
         os.kill(before["1"].pid, signal.SIGKILL)

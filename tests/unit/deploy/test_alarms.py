@@ -96,6 +96,14 @@ def known_labels(name):
     return {*METRICS.get(name, METRICS[plain]).labels, *OWN_LABELS}
 
 
+def test_of_a_group_of_learners_the_one_that_leads_is_asked():
+    """The others count no frames, so their rate is 0 for ever."""
+    asked = [expression for expression in all_expressions() if 'role="learner"' in expression]
+
+    assert len(asked) > 5
+    assert all('role="learner",id="0"' in expression for expression in asked)
+
+
 def test_every_metric_and_label_of_every_expression_is_in_the_table():
     for expression in all_expressions():
         found = re.findall(r"([a-z_]+)(?:\{([^}]*)\})?", re.sub(r"\[\w+\]|\"[^\"]*\"", "", expression))

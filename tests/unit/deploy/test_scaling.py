@@ -26,10 +26,19 @@ def test_the_first_actors_remain(present, actors, expected):
 
 
 def test_what_is_asked_for_is_read(folder):
+    folder.targets.touch()
     with folder.held_by("deploy.local"):
         ask(folder, 6)
 
     assert wanted(folder) == 6
+
+
+def test_a_run_that_starts_or_is_measured_at_its_end_promises_no_actors(folder):
+    """Nobody would read the wish."""
+    with folder.held_by("deploy.local"), pytest.raises(ReportedError, match="night is starting or ending"):
+        ask(folder, 6)
+
+    assert wanted(folder) is None
 
 
 def test_a_run_that_does_not_run_is_refused(folder):
@@ -52,6 +61,7 @@ def test_an_actor_without_a_certificate_is_refused(folder, tmp_path):
     for number in range(2):
         (certificates / f"actor-{number}.pem").touch()
     folder.config.write_text(f'tls = "{certificates}"')
+    folder.targets.touch()
     with folder.held_by("deploy.local"):
         ask(folder, 2)
         with pytest.raises(ReportedError, match=r"actor-2 has no certificate .* --add actor-2"):

@@ -44,11 +44,45 @@ def test_a_name_of_a_certificate_has_its_own_number():
     assert places.give("desk", set(), 0.0) == ("desk", 0)
 
 
+def test_a_name_without_a_number_keeps_the_one_that_it_was_given_while_its_actor_lives():
+    places = Places()
+    assert places.give("gpu-box", set(), 0.0) == ("gpu-box", 0)
+    assert places.give("", {"gpu-box"}, 2.0 * HELD_S) == ("1", 1)
+    assert places.give("gpu-box", {"1"}, 4.0 * HELD_S) == ("gpu-box", 0)  # it has gone, and comes again
+
+
+def test_two_names_with_one_number_get_two(caplog):
+    places = Places()
+    assert places.give("east-0", set(), 0.0) == ("east-0", 0)
+    assert places.give("", set(), 1.0) == ("1", 1)  # east-0 is still starting
+    assert places.give("west-0", {"east-0"}, 2.0) == ("west-0", 2)
+    assert "actor=west-0 gets the number 2: another actor has 0" in caplog.text
+    assert places.give("east-0", {"east-0", "1", "west-0"}, 3.0) == ("east-0", 0)  # the same again
+
+
+def test_no_name_is_given_twice():
+    places = Places()
+    assert places.give("x-2", set(), 0.0)[1] == 2
+    assert places.give("2", {"x-2"}, 1.0) == ("2", 0)
+    present = {"2", "1"}  # x-2 has gone: its number is free, but not the name 2
+    assert places.give("", present, 2.0 * HELD_S) == ("3", 3)
+
+
 def test_a_flood_of_requests_costs_no_memory():
     places = Places()
     given = [places.give("", set(), 0.0)[1] for _ in range(MOST_HELD + 5)]
     assert given[-5:] == [0, 1, 2, 3, 4]
     assert max(given) == MOST_HELD - 1
+
+
+@given(st.lists(st.sampled_from(["", "a", "b", "east-0", "west-0", "3", "x-3", "2"]), max_size=12))
+def test_whatever_their_names_no_two_actors_have_one_number(names):
+    places, living = Places(), {}
+    for now, wish in enumerate(names):
+        name, number = places.give(wish, set(living), now * HELD_S)
+        assert name not in living or living[name] == number
+        living[name] = number
+    assert len(set(living.values())) == len(living)
 
 
 @given(st.sets(st.integers(0, 30)), st.integers(1, 20))
