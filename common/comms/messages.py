@@ -200,6 +200,7 @@ class VerdictKind(StrEnum):
     BUSY = "busy"
     UNREADABLE = "unreadable"  # its sender is unknown: it is damaged, or names another actor than its key
     CREDITS = "credits"  # the answer to an ActorReport
+    LIFE_ENDED = "life_ended"  # the answer to one whose life's account is closed: the actor must start anew
 
 
 # Each sequence number gets exactly one of these. After any other kind the actor sends the rollout again (ADR-0004).

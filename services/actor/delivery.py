@@ -25,7 +25,8 @@ LAST_VERDICTS_S: Final = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S: Final = 2.0
 WAIT_S: Final = 0.05
 REFUSALS: Final = frozenset(VerdictKind) - {
-    *(VerdictKind.ACCEPTED, VerdictKind.DUPLICATE, VerdictKind.BUSY, VerdictKind.CREDITS),
+    *(VerdictKind.ACCEPTED, VerdictKind.DUPLICATE, VerdictKind.BUSY),
+    *(VerdictKind.CREDITS, VerdictKind.LIFE_ENDED),
 }
 
 
@@ -56,6 +57,7 @@ class Delivery:
         self._player, self._policies = player, policies
         self._history, self._metrics = history, metrics
         self.outbox = box.Outbox(config.outbox)
+        self.life_ended = ""  # why the learner hears this life of the actor no more
         self._pending: dict[int, PendingReply] = {}
         self._report: PendingReply | None = None
         self._next_report, self._report_after_s = 0.0, REPORT_INTERVAL_S
@@ -101,7 +103,9 @@ class Delivery:
         if self._report is not None and (outcome := self._report.poll()) is not None:
             self._report = None
             verdict = self._verdict(outcome)
-            if verdict is not None:
+            if verdict is not None and verdict.kind is VerdictKind.LIFE_ENDED:
+                self.life_ended = verdict.reason
+            elif verdict is not None:
                 generation, limit, version = self._known_credits
                 known = (limit, version) if generation == verdict.generation else (0, 0)
                 self.outbox = box.credited(self.outbox, verdict, known)
@@ -110,10 +114,11 @@ class Delivery:
 
     def drop_old(self, now: float) -> None:
         """Give up the rollouts that are too old."""
-        before = len(self.outbox.dropped)
+        before = self.outbox.flights
         self.outbox = box.expired(self.outbox, now)
-        for sequence in self.outbox.dropped[before:]:
-            self._history.note("dropped", number=sequence)
+        for flight in before:
+            if flight not in self.outbox.flights:
+                self._history.note("dropped", number=flight.sequence)
 
     def report_at_once(self) -> None:
         """Make a report due: its answer brings credits."""

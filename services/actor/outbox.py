@@ -7,7 +7,6 @@ answer, a server that is away or busy) until the learner's final verdict, or unt
     published = accepted + refused + dropped + in flight          (`Counts.balance` is 0, always)
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -50,14 +49,16 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class Outbox:
-    """All rollouts of one incarnation of an actor, and the learner's newest credits."""
+    """All rollouts of one incarnation of an actor, and the learner's newest credits; its size is bounded."""
 
     config: OutboxConfig
     next_sequence: int = 0
     flights: tuple[Flight, ...] = ()
     accepted: int = 0
-    refused: tuple[Refusal, ...] = ()
-    dropped: tuple[int, ...] = ()
+    refused_by_kind: tuple[tuple[VerdictKind, int], ...] = ()
+    dropped_count: int = 0
+    refused: tuple[Refusal, ...] = ()  # the newest, as many as a report lists
+    dropped: tuple[int, ...] = ()  # the same
     generation: int = 0  # of the learner that answered last; 0: none yet
     credit_limit: int = 0
     credit_version: int = 0
@@ -68,8 +69,8 @@ class Outbox:
         return Counts(
             published=self.next_sequence,
             accepted=self.accepted,
-            refused=Counter(refusal.kind for refusal in self.refused),
-            dropped=len(self.dropped),
+            refused=dict(self.refused_by_kind),
+            dropped=self.dropped_count,
             in_flight=len(self.flights),
         )
 
@@ -127,7 +128,14 @@ def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Out
     if verdict.first is VerdictKind.ACCEPTED:
         return replace(outbox, flights=rest, accepted=outbox.accepted + 1)
     refusal = Refusal(sequence=sequence, kind=verdict.first, generation=verdict.generation)
-    return replace(outbox, flights=rest, refused=(*outbox.refused, refusal))
+    counts = dict(outbox.refused_by_kind)
+    counts[refusal.kind] = counts.get(refusal.kind, 0) + 1
+    # Apart, since a report lists those of earlier learners alone
+    old, own = (
+        [r for r in outbox.refused if (r.generation == refusal.generation) is own] for own in (False, True)
+    )
+    newest = (*old[-LISTED_REFUSALS:], *own[-LISTED_REFUSALS + 1 :], refusal)
+    return replace(outbox, flights=rest, refused_by_kind=tuple(sorted(counts.items())), refused=newest)
 
 
 def credited(outbox: Outbox, verdict: Verdict, known: tuple[int, int] = (0, 0)) -> Outbox:
@@ -155,7 +163,8 @@ def expired(outbox: Outbox, now: float) -> Outbox:
         if not flight.under_way and flight.tries > 0 and now - flight.born >= outbox.config.give_up_s
     ]
     rest = tuple(flight for flight in outbox.flights if flight.sequence not in too_old)
-    return replace(outbox, flights=rest, dropped=(*outbox.dropped, *too_old))
+    newest = (*outbox.dropped, *too_old)[-LISTED_REFUSALS:]
+    return replace(outbox, flights=rest, dropped_count=outbox.dropped_count + len(too_old), dropped=newest)
 
 
 def report(
@@ -176,7 +185,7 @@ def report(
         version=version,
         published=outbox.next_sequence,
         in_flight=tuple(flight.sequence for flight in outbox.flights),
-        dropped=outbox.dropped[-LISTED_REFUSALS:],
+        dropped=outbox.dropped,
         generation=outbox.generation,
         refused=tuple(r for r in outbox.refused if r.generation != outbox.generation)[-LISTED_REFUSALS:],
         leaving=leaving,

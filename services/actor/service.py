@@ -7,6 +7,7 @@ from threading import Event
 from typing import Final
 
 from common.comms.transport import Transport
+from common.errors import ReportedError
 from common.service.history import History
 from common.service.member import Member
 from common.service.metrics import Metrics
@@ -24,6 +25,10 @@ log = logging.getLogger(__name__)
 
 IDLE_WAIT_S: Final = 0.05
 MOST_REASONS: Final = 16  # of waiting, that the log names while an actor is idle
+
+
+class LifeEndedError(ReportedError):
+    """The learner has closed this life's account, such as after a day without a link: only a new life is heard."""
 
 
 class ActorService:
@@ -88,7 +93,11 @@ class ActorService:
         return self._member.is_draining and not self._delivery.outbox.flights
 
     def step(self, now: float) -> float:
-        """Do what is due, play one rollout if the learner needs one, and return how long to wait [s]."""
+        """Do what is due, play one rollout if the learner needs one, and return how long to wait [s].
+
+        Raises:
+            LifeEndedError: The learner hears only a new life of this actor.
+        """
         self._member.answer_control()
         self._member.note_link(now)
         delivery = self._delivery
@@ -97,6 +106,8 @@ class ActorService:
             # The learner needs new rollouts of a new version
             delivery.report_at_once()
         delivery.take_verdicts(now)
+        if delivery.life_ended:
+            raise LifeEndedError(delivery.life_ended)
         delivery.drop_old(now)
         delivery.send(now)
         reason = self._idle_reason(now)
@@ -121,6 +132,9 @@ class ActorService:
                     self._transport.wait(wait)
         except StopRequested:
             log.info("stopped within a rollout, which is not sent")
+        except LifeEndedError:
+            self.leave()
+            raise
         self.leave()
 
     def leave(self) -> None:

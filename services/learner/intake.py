@@ -185,6 +185,8 @@ class Intake:
         self._now = now
         learner = self._learner_state
         life = (report.actor, report.incarnation)
+        if ended := self._accounts.closed_reason(life):
+            return self._verdict(VerdictKind.LIFE_ENDED, VerdictKind.LIFE_ENDED, ended)
         if fault := differs("run", report.run, learner.run) or self._fault(life, report.published):
             return self._verdict(VerdictKind.WRONG_RUN, VerdictKind.WRONG_RUN, fault)
         account = self._accounts.open(life)

@@ -16,7 +16,7 @@ _MEMBERS: Final = ("generator", "actor", "evaluator")
 
 def begin(metrics: Metrics) -> None:
     """Export 0 for every label that counts: from nothing to 1 is no rise for Prometheus."""
-    for verdict in set(VerdictKind) - {VerdictKind.CREDITS}:
+    for verdict in set(VerdictKind) - {VerdictKind.CREDITS, VerdictKind.LIFE_ENDED}:
         metrics.inc("topspin_rollouts_received_total", 0.0, verdict=verdict.value)
     for outcome in Outcome:
         if outcome is not Outcome.NONE:

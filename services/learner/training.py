@@ -243,13 +243,15 @@ class Training:
         return read(rollouts, model, distillation, self.progress.version, on_tick)
 
     def _rate(self, mode: UpdateMode, bound: float) -> float:
-        """Return the learning rate at the start of an update."""
+        """Return the learning rate at the start of an update: half of its schedule's for each rollback."""
         ppo = self.ppo
+        if mode is UpdateMode.PPO and ppo.schedule == "adaptive":
+            return min(self.progress.learning_rate, bound)  # a rollback has halved it
+        scheduled = bound
         if mode is UpdateMode.DISTILL:
             share = self.progress.version / self.teacher.epochs
-            return decayed(share, ppo.learning_rate, ppo.learning_rate_min)
-        is_bound = mode is UpdateMode.CRITIC_ONLY or ppo.schedule == "constant_then_linear"
-        return bound if is_bound else min(self.progress.learning_rate, bound)
+            scheduled = decayed(share, ppo.learning_rate, ppo.learning_rate_min)
+        return max(scheduled * 0.5**self.progress.rollbacks, ppo.learning_rate_min)
 
     def weights(self, which: EvaluatedWeights) -> ActorCritic:
         """Return the network with the newest weights, or the one with their running mean."""

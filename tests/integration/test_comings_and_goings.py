@@ -16,6 +16,7 @@ from common.policy.config import NetworkConfig
 from common.policy.folder import load_policy, save_policy
 from common.task.config import TaskConfig
 from services.actor.rally_feed import NoRalliesError
+from services.actor.service import LifeEndedError
 from services.learner.checkpoint import CheckpointError
 from services.learner.config import IntakeConfig
 from services.learner.service import RunExistsError
@@ -160,6 +161,22 @@ def test_a_planned_stop_and_resume_lose_nothing(tmp_path):
     assert ledger.balance == 0
     assert ledger.refused == {}
     assert ledger.trained == 3 * progress(again).epoch
+
+
+def test_an_actor_whose_life_is_closed_ends_so_that_a_new_one_is_started(tmp_path, monkeypatch):
+    """Such as after a day without a link. It would wait for credits for ever, and look well."""
+    with local_run(tmp_path, curriculum=LONG) as s:
+        learner = s.learner()
+        s.generator()
+        actor = s.actor(0, run=False)
+        wait_until(
+            lambda: actor.service.step(time.monotonic()) and actor.service.counts.accepted, 60, "a verdict"
+        )
+        reason = "life 7 of actor 0 ended, and its account is closed: start the actor again"
+        monkeypatch.setattr(learner.service._intake._accounts, "closed_reason", lambda life: reason)
+
+        with pytest.raises(LifeEndedError, match=reason):
+            wait_until(lambda: actor.service.step(time.monotonic()) < 0.0, 60, "the end")
 
 
 def test_an_actor_that_leaves_sends_its_unanswered_rollouts(tmp_path):

@@ -1,5 +1,6 @@
 import pytest
 
+from common.comms.budgets import LISTED_REFUSALS
 from common.comms.messages import FINAL_VERDICTS, Refusal, VerdictKind
 from services.actor import outbox as ob
 from services.actor.config import OutboxConfig
@@ -133,3 +134,27 @@ def test_a_report_lists_what_the_current_learner_cannot_know():
 
     assert (same.published, same.in_flight, same.refused, same.generation) == (2, (1,), (), 1)
     assert (other.refused, other.generation) == ((Refusal(0, VerdictKind.TOO_OLD, 1),), 2)
+
+
+def test_what_an_actor_remembers_does_not_grow_with_its_refusals_and_drops():
+    """In a fleet that is refused for weeks, each verdict would cost more than the last."""
+    outbox, kinds = Outbox(CONFIG), (VerdictKind.TOO_OLD, VerdictKind.STALE_STAGE)
+    for n in range(3 * LISTED_REFUSALS):
+        sequence, generation = outbox.next_sequence, 1 + (n > 2 * LISTED_REFUSALS)
+        outbox = ob.sent(ob.offer(outbox, b"", 0.0), sequence)
+        outbox = ob.answered(outbox, sequence, make_verdict(kinds[n % 2], generation=generation), 0.0)
+        sequence = outbox.next_sequence
+        outbox = ob.unanswered(ob.sent(ob.offer(outbox, b"", 0.0), sequence), sequence, 0.0)
+        outbox = ob.expired(outbox, 1e6)
+
+    counts = outbox.counts
+    assert counts.balance == 0
+    assert sum(counts.refused.values()) == counts.dropped == 3 * LISTED_REFUSALS
+    assert counts.refused == {kind: 3 * LISTED_REFUSALS / 2 for kind in kinds}
+    assert len(outbox.refused) <= 2 * LISTED_REFUSALS
+    said = ob.report(outbox, run="r", actor="a", incarnation=1, version=1, training_hash="h")
+    assert said.dropped == tuple(range(4 * LISTED_REFUSALS + 1, 6 * LISTED_REFUSALS, 2))
+    # Refusals of the learner before, the newest; those of the present learner are in its own ledger
+    assert [r.sequence for r in said.refused] == [
+        2 * n for n in range(LISTED_REFUSALS + 1, 2 * LISTED_REFUSALS + 1)
+    ]

@@ -47,10 +47,25 @@ def test_the_first_rule_that_applies_decides(changes, kind, reason):
 
 
 def test_every_kind_of_verdict_on_a_rollout_has_its_rule():
-    others = {VerdictKind.UNREADABLE, VerdictKind.CREDITS}
+    others = {VerdictKind.UNREADABLE, VerdictKind.CREDITS, VerdictKind.LIFE_ENDED}
 
     assert [kind for kind, _ in RULES][-1] is VerdictKind.ACCEPTED
     assert {kind for kind, _ in RULES} == set(VerdictKind) - others
+
+
+def test_a_report_of_a_life_whose_account_is_closed_gets_a_verdict_of_its_own():
+    intake = make_intake(dataset_rollouts=1)
+    intake.arrive(make_header(0), ROLLOUT, 0.0)
+    intake.take_dataset()
+    intake.finish_update(LEARNER_STATE)
+    said = make_report(Outbox(OutboxConfig(), next_sequence=1, generation=1))
+    intake.gone(said.actor, said.incarnation)
+    intake.tidy(86_401.0)
+
+    verdict = intake.report(said, 86_402.0)
+
+    assert (verdict.kind, verdict.credit_limit) == (VerdictKind.LIFE_ENDED, 0)
+    assert verdict.reason.endswith("ended, and its account is closed: start the actor again")
 
 
 def test_a_retry_gets_the_recorded_verdict_whatever_has_changed_since():

@@ -15,6 +15,7 @@ from services.learner.checkpoint import CheckpointError, Extras, checkpoints, re
 from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.curriculum import StageLengths
 from services.learner.epoch_stats import play_stats
+from services.learner.ppo import UpdateMode
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
 from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
@@ -392,3 +393,18 @@ def test_two_threads_reach_what_one_reaches():
     finally:
         torch.set_num_threads(before)
     torch.testing.assert_close(trained[0], trained[1], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("schedule", ["adaptive", "constant_then_linear"])
+@pytest.mark.parametrize("teacher", [TeacherConfig(), TeacherConfig(policy="somewhere", epochs=1000)])
+def test_each_rollback_halves_the_learning_rate_whatever_decides_it(schedule, teacher):
+    training = make_training(ppo=PPO.model_copy(update={"schedule": schedule}))
+    training.teacher = teacher
+    training.run_epoch(dataset(0))
+    mode = UpdateMode.DISTILL if teacher.policy else UpdateMode.PPO
+    before = training._rate(mode, PPO.learning_rate_max)
+    for _ in range(2):
+        training.go_back(lambda _: None)
+
+    assert training._rate(mode, PPO.learning_rate_max) == pytest.approx(before / 4)
+    assert training._rate(UpdateMode.CRITIC_ONLY, PPO.learning_rate_min) == PPO.learning_rate_min
