@@ -3,11 +3,10 @@
     python -m benchmarks.ablation --seeds 0,1,2 --json
 
 Hu et al. compare the curriculum with stage 3 alone, and their collision equations with the simulator's own contacts.
-All three arms here are the default method without what acts in stage 3 alone: hit corrections with the way home, the
-bonus for the predicted landing, and the bound of the action noise that corrections need. Stages have the authors'
-shares of the frames. The last weights of each run play the same 2,000 balls with the measured bounces, whatever
-contacts they were trained with. Differences are taken seed by seed. Trainings are made once (``benchmarks.trainings``),
-and the program goes on where it was stopped.
+All three arms here are the default method without what acts in stage 3 alone: the way home after a hit, and the bonus
+for the predicted landing. Stages have the authors' shares of the frames. The last weights of each run play the same
+2,000 balls with the measured bounces, whatever contacts they were trained with. Differences are taken seed by seed.
+Trainings are made once (``benchmarks.trainings``), and the program goes on where it was stopped.
 """
 
 import json
@@ -28,10 +27,9 @@ from common.service.run_folder import RunFolder
 from topspin.report.paired import over_seeds
 
 BASE: Final[dict[str, str]] = {
-    "experience.hit-correction": "false",
+    "experience.leads-home": "false",
     "learner.ppo.correction-weight": "0",
     "task.reward.landing-bonus": "0",
-    "learner.curriculum.aiming-log-std": "1",
     "learner.curriculum.stage-shares": "0.14,0.48,0.38",
     "final-rallies": "2000",
 }

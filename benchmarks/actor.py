@@ -2,7 +2,7 @@
 
     python -m benchmarks.actor --json
 
-It plays rollouts as an actor does: inference, noise, environment, hit corrections. The limit is ``Batch.step`` of the
+It plays rollouts as an actor does: inference, noise, environment, the way home. The limit is ``Batch.step`` of the
 same robots with the same actions. Both alternate on one thread.
 """
 

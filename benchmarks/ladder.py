@@ -78,12 +78,11 @@ RUNGS: Final = (
         },
     ),
     Rung(
-        "hits are corrected, and the robot is led home after them",
+        "the robot is led home after its hits; after a stage change the critic learns first",
         {
-            "experience.hit-correction": "true",
+            "experience.leads-home": "true",
             "learner.ppo.correction-weight": "500",
             "learner.ppo.refit-frames": "200000",
-            "learner.curriculum.aiming-log-std": "-2.5",
         },
     ),
     Rung(

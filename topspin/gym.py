@@ -94,7 +94,7 @@ class RallyBatch:
         self._count, self._stage, self._options = count, stage, options
         given = {**DEFAULTS, **settings}
         episodes = {name: given.pop(name) for name in _EPISODES}
-        self._experience = _of_settings(ExperienceConfig, {"hit_correction": False, **episodes})
+        self._experience = _of_settings(ExperienceConfig, {"leads_home": False, **episodes})
         task = _of_settings(TaskConfig, given)
         observation = task.observation.model_copy(update={"critic": "policy"})
         self.task = task.model_copy(update={"observation": observation})

@@ -17,6 +17,7 @@ from services.actor.outbox import Outbox
 from services.learner.admission import Header, LearnerState
 from services.learner.config import IntakeConfig
 from services.learner.intake import Intake
+from services.learner.turns import Rank, taken
 
 ACTORS: Final = ("a", "b")
 LIFE: Final = 1
@@ -210,7 +211,9 @@ def _delivered(state: State, message: Message) -> State:
 
 def _learner_steps(state: State, bounds: Bounds) -> Iterator[tuple[str, State]]:
     intake: Intake = pickle.loads(state.intake)
-    dataset = intake.take_dataset()
+    rank = Rank(intake.queued, *intake.contributors(0.0), 0)
+    (count,) = taken([rank], INTAKE.dataset_rollouts)
+    dataset = intake.take(count) if count else ()
     learner = state.learner
     if dataset:
         version = learner.version + 1

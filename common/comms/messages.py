@@ -168,8 +168,8 @@ class Rollout:
     ]  # after step T: bootstrap at the block's end
     episodes: Episodes
     reward_terms: Annotated[F32, Wire("reward", "<f4", "R")]  # sum over the block, by term
-    # Target change of the actions before a hit (hit_correction.correction), or difference to the teacher's actions. A
-    # row of zeros: no correction
+    # Target change of the mean action on the way home (actor.way_home), or difference to the teacher's action. A row
+    # of zeros: no correction
     corrections: Annotated[F32, Wire("half-range", "<f4", "T B 7", sent="<f2")]
     seconds: Numbers = field(default_factory=lambda: MappingProxyType({}))  # by phase of the actor's loop
 

@@ -18,7 +18,6 @@ from common.env.mujoco_ball import (
     BALL_QUAT,
     BALL_SPIN,
     BALL_VEL,
-    RACKET_ROW,
     RobotAndBall,
     obstacles,
     to_world,
@@ -27,11 +26,11 @@ from common.env.robot import RobotBatch
 from common.jit import kernel
 from common.physics import touch
 from common.physics.chain import joint_rates_at, joints_at, point_velocity, racket_state
-from common.physics.constants import BALL_RADIUS, GRID_STEP
+from common.physics.constants import BALL_RADIUS
 from common.physics.fly import Segment
 from common.physics.vec import axpy
 from common.rally.finish import apply_touch, finish_step
-from common.rally.hit_correction import BOUNCE, FRESH, write_contact, write_departure
+from common.rally.hit import FRESH, write_contact
 from common.rally.sensing import advance_clock, record_detections
 from common.rally.state import FlightResult, Rallies, RobotMotion, Rules, Step
 from common.rally.step import MAX_SPEED_REWARDED, copy_path
@@ -87,14 +86,11 @@ def _follow(
     state, outcome = rallies.state[b], 0
     bounced, hit, landed = False, False, False
     racket_speed = 0.0
-    # Whether the ball is in contact with the racket. A hit that lasts longer than its control step is not corrected
-    is_pressed = False
     per_grid_step = qpos.shape[0] // rules.grid_steps
     has_camera, keeps_hits = rallies.camera_state.shape[0] > 0, rallies.hit.shape[0] > 0
     if keeps_hits:
         rallies.hit[b, FRESH] = 0.0
     for k in range(qpos.shape[0]):
-        since_launch = rallies.clock[b] * GRID_STEP + (k % per_grid_step) * motion.step
         for obstacle in range(found.shape[1]):
             is_new = found[k, obstacle] > 0.0 and free[obstacle] > FREE_SUBSTEPS
             free[obstacle] = 0 if found[k, obstacle] > 0.0 else free[obstacle] + 1
@@ -112,12 +108,8 @@ def _follow(
                 surface_vel = point_velocity(pose.centre, racket_vel, racket_spin, contact)
                 racket_speed = min(max(surface_vel[0], 0.0), MAX_SPEED_REWARDED)
                 if keeps_hits and rules.transitions[state, _RACKET] == _TAU_2:
-                    now = rallies.clock[b] // rules.grid_steps
-                    write_contact(rallies.hit[b], pos, vel, spin, joints, rates, moment, now, since_launch)
-                    is_pressed = True
+                    write_contact(rallies.hit[b], pos, joints, rates)
             state, outcome = apply_touch(rallies, b, state, what, pos, rules)
-            if keeps_hits and state == _TAU_1:
-                rallies.hit[b, BOUNCE] = since_launch
         if outcome == 0:
             p, v, w = qpos[k, BALL_POS:], qvel[k, BALL_VEL:], qvel[k, BALL_SPIN:]
             p0, v0 = pos, vel
@@ -131,9 +123,6 @@ def _follow(
                     Segment(p0, v0, pos, vel, motion.step),
                 )
             spin = to_world(qpos[k, BALL_QUAT:], (w[0], w[1], w[2]))
-            if is_pressed and free[RACKET_ROW] > 0:
-                write_departure(rallies.hit[b], pos, vel, spin)
-                is_pressed = False
             if abs(pos[0]) > touch.PLAY_X or abs(pos[1]) > touch.PLAY_Y:
                 state, outcome = apply_touch(rallies, b, state, _OUT, pos, rules)
             if state in (_TAU_2, _TAU_23) and pos[0] > BALL_RADIUS:

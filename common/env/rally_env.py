@@ -7,7 +7,6 @@ import numpy as np
 import numpy.typing as npt
 
 from common.env.contacts import Contacts, TailoredContacts
-from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections, HitCorrector
 from common.env.mujoco_ball import RobotAndBall
 from common.env.mujoco_contacts import MujocoContacts
 from common.env.robot import RobotBatch
@@ -83,7 +82,6 @@ class EnvStep:
     final_obs: Floats  # (n, D) the last observation of each of ``ended``
     terms: Array  # (B, 8) reward.TERMS
     finished: FinishedRallies
-    hit_corrections: HitCorrections  # of the hits in this step
 
 
 @kernel
@@ -123,12 +121,12 @@ class RallyEnv:
         task: The task.
         source: Where rallies come from.
         stage: Curriculum stage 1..3: the column of the reward table.
-        experience: When episodes end or continue, and whether hits are corrected; ``experience.MATCH`` for a match.
+        experience: When episodes end or continue; ``experience.MATCH`` for a match.
         threads: MuJoCo threads.
         path_rows: Samples of a recorded track that drives a ball until it is hit. 0: physics alone moves the balls.
         extra_observation: Options of a second observation of the same rallies (``observe_extra``), such as a teacher's.
             Its history is not longer than the task's.
-        keeps_hits: Whether ``rallies.hit`` is written although hits are not corrected.
+        keeps_hits: Whether ``rallies.hit`` is written.
         profile: Ranges of what differs from rally to rally; None: those that the task names.
         begins_late: Whether an environment that ended begins its next episode in place of its next control step. That
             step ignores its action and pays nothing; its robot holds its last target.
@@ -151,8 +149,6 @@ class RallyEnv:
     ) -> None:
         if path_rows and task.collision == "original":
             raise ValueError("recorded tracks under collision 'original'; allowed: collision 'tailored'")
-        if begins_late and experience.hit_correction:
-            raise ValueError("begins_late with hit_correction; allowed: one of them")
         self.count = count
         self.task = task
         self.experience = experience
@@ -161,9 +157,6 @@ class RallyEnv:
         self._profile = profile or profile_of(task.randomization, task.rubber)
         self.home_action: Floats = self.robot.home_action.astype(np.float32)
         self._source = source
-        self._hit_corrector = (
-            HitCorrector(self.robot, task.flight_model) if experience.hit_correction else None
-        )
         self._flags = observation_flags(task.observation)
         self._extra_observation = extra_observation
         self._rallies, self._step = allocate(
@@ -171,7 +164,7 @@ class RallyEnv:
             task.observation.history,
             has_camera=task.perception == "full",
             tracks=self._new_tracks(),
-            keeps_hits=experience.hit_correction or keeps_hits,
+            keeps_hits=keeps_hits,
             path_rows=path_rows,
         )
         self._validated = np.zeros(count, np.bool_)
@@ -210,9 +203,9 @@ class RallyEnv:
         )
 
     @property
-    def corrects(self) -> bool:
-        """Whether actions are corrected now: before and after hits, in stage 3."""
-        return self._hit_corrector is not None and self.stage == 3
+    def leads_home(self) -> bool:
+        """Whether a policy learns now, in stage 3, to go home after its hits."""
+        return self.experience.leads_home and self.stage == 3
 
     @property
     def validated(self) -> Flags:
@@ -281,9 +274,6 @@ class RallyEnv:
         terminated[ended] = True
         terminated &= ~truncated
         final_obs = self._obs[ended]
-        hit_corrections = NO_HIT_CORRECTIONS
-        if self._hit_corrector is not None:
-            hit_corrections = self._hit_corrector.update(self._rallies, self._contacts.motion, self.corrects)
         finished = self._finish(over)
         same_episode = np.zeros(begins.size, np.bool_)
         if self._begins_late:
@@ -301,7 +291,6 @@ class RallyEnv:
             final_obs=final_obs,
             terms=self._step.terms.copy(),
             finished=finished,
-            hit_corrections=hit_corrections,
         )
 
     def observe_extra(self) -> Floats:

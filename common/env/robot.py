@@ -8,13 +8,11 @@ import numpy as np
 import numpy.typing as npt
 from mujoco.batch import Batch
 
-from common.jit import kernel
 from common.physics.chain import JOINTS, Chain
-from common.rally.hit_correction import CURRENT, FREE, VOLTAGE
 from common.rally.state import RobotMotion
 from common.robot.chain_of import chain_of
 from common.robot.description import RobotDescription, describe
-from common.robot.model import CUBIC_LOSS, LINEAR_LOSS, NO_LOAD, STALL, LinkSensors, load_model
+from common.robot.model import LinkSensors, load_model
 
 log = logging.getLogger(__name__)
 
@@ -27,18 +25,6 @@ MUJOCO_STEP_200_HZ = 0.0025  # [s] where 4 ms don't divide the control period: a
 _START_TIME = 1.0  # [s] MuJoCo's time at the start of each control step; a reset simulation starts at 0 again
 MAX_ACTION_LATENCY = 0.020  # [s] targets are kept so long: the longest action latency of all profiles
 _KP, _KV = 4, 6  # columns of a dcmotor's gain parameters
-# [-] of a drive's largest force: a force so near a limit of current or voltage does not depend on the target
-_AT_CURRENT, _AT_VOLTAGE = 1e-9, 0.02
-
-
-def inertia_at_home(model: mujoco.MjModel) -> Array:
-    """Return the joints' mass matrix at the home pose (7, 7) [kg, kg m, kg m^2]."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    inertia = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, inertia)
-    return inertia[:7, :7]
 
 
 def home_action(name: str = "rails") -> npt.NDArray[np.float32]:
@@ -48,35 +34,6 @@ def home_action(name: str = "rails") -> npt.NDArray[np.float32]:
     home = np.array([joint.home for joint in joints])
     action: npt.NDArray[np.float32] = ((home - 0.5 * (low + high)) / (0.5 * (high - low))).astype(np.float32)
     return action
-
-
-@kernel
-def _record_limits(
-    motion: RobotMotion,
-    start_vel: Array,
-    torque_limit: Array,
-    speed_limit: Array,
-    limits: npt.NDArray[np.int8],
-    losses: npt.NDArray[np.float32],
-) -> None:
-    """Write each drive's limit and the slope of its losses (B, n, 7) at the start of each substep.
-
-    MuJoCo computes the force from the speed there.
-    """
-    for b in range(limits.shape[0]):
-        for j in range(JOINTS):
-            at, speed = motion.start_pos[b, j], start_vel[b, j] / speed_limit[j]
-            for k in range(limits.shape[1]):
-                force = motion.torque[b, k, j] / torque_limit[j]
-                by_voltage = STALL * (1.0 - abs(speed) / NO_LOAD)
-                forward = force if speed > 0.0 else -force if speed < 0.0 else 0.0
-                limits[b, k, j] = VOLTAGE if forward >= by_voltage - _AT_VOLTAGE else FREE
-                if abs(force) >= 1.0 - _AT_CURRENT:
-                    limits[b, k, j] = CURRENT
-                slope = LINEAR_LOSS + 3.0 * CUBIC_LOSS * speed * speed
-                losses[b, k, j] = slope * (torque_limit[j] / speed_limit[j])
-                after = motion.joint_pos[b, k, j]
-                at, speed = after, (after - at) / motion.step / speed_limit[j]
 
 
 class RobotBatch:
@@ -145,7 +102,7 @@ class RobotBatch:
         self._late_substeps = np.zeros(count, np.int64)
         self._substep_index = np.arange(self.substeps)
         self._control = np.empty((count, self.substeps, 7))
-        self._start, self._start_vel = np.empty((count, 7)), np.empty((count, 7))
+        self._start = np.empty((count, 7))
         self._records: dict[str, Array] = {}
         self.go_home(np.arange(count), np.zeros((count, 7)))
 
@@ -162,25 +119,6 @@ class RobotBatch:
         self._damping[rows, :7] = self._damping_nominal * factors[:, 2]
         self._late_substeps[rows] = np.rint(action_latency / self.step_s).astype(np.int64)
 
-    @property
-    def drives(self) -> Array:
-        """The drives (5, 7) as in ``DriveHistory.drives``."""
-        inertia = np.diag(inertia_at_home(self.model))
-        back_emf = STALL / NO_LOAD * self.torque_limit / self.speed_limit
-        return np.stack([inertia, self._kp, self._kv, self.half_range, back_emf])
-
-    def record_limits(
-        self, motion: RobotMotion, limits: npt.NDArray[np.int8], losses: npt.NDArray[np.float32]
-    ) -> None:
-        """Write what ``DriveHistory`` keeps of a control step's substeps.
-
-        Args:
-            motion: Of the control step.
-            limits: What limited each drive (B, n, 7): ``hit_correction.FREE``, CURRENT or VOLTAGE; written.
-            losses: Slope of its losses and its speed (B, n, 7); written.
-        """
-        _record_limits(motion, self._start_vel, self.torque_limit, self.speed_limit, limits, losses)
-
     def push_racket(self, impulse: Array) -> None:
         """Apply impulses (B, 6) [N s, N m s] at the racket's centre, spread over the next control step."""
         self._wrench[:, self._racket] = impulse * (1.0 / (self.substeps * self.step_s))
@@ -192,7 +130,6 @@ class RobotBatch:
         """
         target = self.middle + self.half_range * actions
         self._start[:] = self.joint_pos
-        self._start_vel[:] = self.joint_vel
         self._time[:] = _START_TIME
         np.copyto(self._control, target[:, None, :])
         for age, earlier in enumerate(self._earlier_targets):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from common.env.rally_env import EnvStep, RallyEnv
 from common.physics.chain import racket_state
-from common.rally.hit_correction import BALL_POS, FRESH, JOINT_POS, JOINT_VEL
+from common.rally.hit import BALL_POS, FRESH, JOINT_POS, JOINT_VEL
 from common.robot.description import describe
 from common.task.config import RobotName
 

@@ -1,1 +1,1 @@
-"""One control step of many rallies: state, flight and touches, perception, observation, reward, hit correction."""
+"""One control step of many rallies: state, flight and touches, perception, observation, reward."""

@@ -10,7 +10,7 @@ from common.perception.camera_filter import ESTIMATE
 from common.perception.flight_track import new_tracks
 from common.physics.chain import Chain
 from common.physics.vec import Vec
-from common.rally.hit_correction import HIT
+from common.rally.hit import HIT
 from common.task.randomization import MAX_LATENCY_STEPS, RALLY_PARAMETERS
 from common.task.reward import TERMS
 
@@ -50,7 +50,7 @@ class Rallies(NamedTuple):
     # with four separate arrays every step of every rally took twice as long, with and without a camera.
     camera_state: Array
     track: Array  # (B, TRACK) the flight filter's state
-    hit: Array  # (B, HIT) the last legal contact, for the hit correction
+    hit: Array  # (B, HIT) the last legal contact; no rows: it is not kept
     last_action: Array  # (B, 7)
 
 
@@ -122,7 +122,7 @@ def allocate(
         has_camera: Whether camera and camera filter measure the ball. Otherwise the measurement is the true state,
             late and noisy.
         tracks: ``flight_filter.new_tracks`` where the observation needs the flight filter.
-        keeps_hits: Whether contacts are kept for the hit correction.
+        keeps_hits: Whether contacts are kept, for measures of the robot.
         path_rows: Samples of a recorded track that drives a ball until it is hit. 0: physics alone moves it.
     """
     rallies = Rallies(

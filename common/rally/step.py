@@ -20,7 +20,7 @@ from common.physics.table_bounce import table_bounce
 from common.physics.touch import NONE, OPPONENT_COURT, RACKET, ROBOT_COURT
 from common.physics.vec import Vec, axpy, cross, dot, scale, sub
 from common.rally.finish import apply_touch, finish_step
-from common.rally.hit_correction import BOUNCE, FRESH, write_contact, write_departure
+from common.rally.hit import FRESH, write_contact
 from common.rally.sensing import advance_clock, record_detections, update_perception
 from common.rally.state import RING, Array, FlightResult, Integers, Rallies, RobotMotion, Rules, Step
 from common.task.launch import DRAG_FACTOR, KIND, LIFT_FACTOR
@@ -123,7 +123,6 @@ def _hit_ball(
     normal: Vec,
     robot: RobotPath,
     moment: float,
-    since: float,
     is_kept: bool,
     rules: Rules,
     step: Step,
@@ -137,8 +136,7 @@ def _hit_ball(
         normal: Unit normal of the racket's face, towards the ball.
         robot: Its motion in this control step.
         moment: Time of the contact since the control step's start [s].
-        since: Time of the contact since the launch [s].
-        is_kept: Whether the contact is kept for the hit correction.
+        is_kept: Whether the contact is kept.
         rules: The rules.
         step: The impulse on the racket is added.
 
@@ -156,12 +154,9 @@ def _hit_ball(
     if dot(sub(vel, surface_vel), normal) >= 0.0:
         return vel, spin, 0.0, False
     if is_kept:
-        control_step = rallies.clock[b] // rules.grid_steps
-        write_contact(rallies.hit[b], pos, vel, spin, joints, rates, moment, control_step, since)
+        write_contact(rallies.hit[b], pos, joints, rates)
     before = vel
     vel, spin = racket_bounce(vel, spin, normal, surface_vel, rubber_of(rallies.parameters[b]))
-    if is_kept:
-        write_departure(rallies.hit[b], pos, vel, spin)
     impulse = scale(BALL_MASS, sub(before, vel))
     turn = cross(sub(contact, centre), impulse)
     for k in range(3):
@@ -202,7 +197,6 @@ def _fly_one(
                 rallies.over[b] = True
             if what == NONE:
                 break
-            since_launch = rallies.clock[b] * GRID_STEP + (GRID_STEP - rest)
             if what in (ROBOT_COURT, OPPONENT_COURT):
                 vel, spin = table_bounce(
                     vel,
@@ -215,14 +209,12 @@ def _fly_one(
                 is_kept = keeps_hits and rules.transitions[state, RACKET] == _TAU_2
                 moment = start + flown
                 vel, spin, speed, has_contact = _hit_ball(
-                    rallies, b, (pos, vel, spin), normal, robot, moment, since_launch, is_kept, rules, step
+                    rallies, b, (pos, vel, spin), normal, robot, moment, is_kept, rules, step
                 )
                 if not has_contact:
                     continue
                 racket_speed = speed
             state, outcome = apply_touch(rallies, b, state, what, pos, rules)
-            if keeps_hits and state == _TAU_1:
-                rallies.hit[b, BOUNCE] = since_launch
             bounced, hit, landed = (
                 bounced or state == _TAU_1,
                 hit or state == _TAU_2,

@@ -1,4 +1,4 @@
-"""How training plays the task: when episodes end or continue, hit corrections, and the teacher."""
+"""How training plays the task: when episodes end or continue, the way home, and the teacher."""
 
 from typing import Final
 
@@ -53,13 +53,12 @@ class ExperienceConfig(BaseModel):
         description="share of episodes that end when the ball is hit: its flight is simulated to the landing and paid "
         "at once",
     )
-    hit_correction: bool = Field(
+    leads_home: bool = Field(
         True,
-        description="in stage 3 correct the last actions before each hit (hit_correction.py), and lead the robot home "
-        "after it",
+        description="in stage 3 lead the robot home after each hit: the next ball finds it where this one left it",
     )
     teacher: TeacherConfig = TeacherConfig()
 
 
-MATCH: Final = ExperienceConfig(continue_share=0.0, end_at_hit_share=0.0, hit_correction=False)
-"""How a match plays: every rally to its end, without teacher and without corrections."""
+MATCH: Final = ExperienceConfig(continue_share=0.0, end_at_hit_share=0.0, leads_home=False)
+"""How a match plays: every rally to its end, without a teacher."""

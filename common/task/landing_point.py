@@ -1,4 +1,4 @@
-"""Where a ball that was hit will land: for the landing bonus of stage 3 and for the hit correction."""
+"""Where a ball that was hit will land: for the landing bonus of stage 3."""
 
 import math
 from typing import Final
@@ -10,8 +10,6 @@ from common.physics.vec import Vec
 
 LONGEST_RETURN: Final = 3.0  # [s] longest time from the hit until the ball is on the floor
 SHORT_OF_NET: Final = -1.0  # [m] clearance of the net for a ball that comes down before it
-_COARSE_STEP: Final = 0.010  # [s]
-_DEEPEST: Final = -0.7  # [m] a ball is not followed deeper below the table
 
 
 @kernel
@@ -47,30 +45,3 @@ def landing_point(pos: Vec, vel: Vec, spin: Vec, air: Air) -> tuple[float, float
             x, y = before[0] + share * (pos[0] - before[0]), before[1] + share * (pos[1] - before[1])
             return x, y, over_net
     return pos[0], pos[1], over_net
-
-
-@kernel
-def landing_and_clearance(pos: Vec, vel: Vec, spin: Vec, air: Air) -> tuple[float, float, float]:
-    """Return where a ball comes down to the table's height, x and y [m], and its clearance of the net [m].
-
-    A ball that comes down before the net is followed below the table. So its negative clearance is known, which
-    ``landing_point`` does not give. Steps are coarser, because the hit correction takes differences of many flights.
-    """
-    over_net = SHORT_OF_NET
-    x, y, is_down = pos[0], pos[1], False
-    for _ in range(math.ceil(LONGEST_RETURN / _COARSE_STEP)):
-        before = pos
-        pos, vel = flight_step(pos, vel, spin, _COARSE_STEP, air)
-        if before[0] < 0.0 <= pos[0]:
-            over_net = _over_net(before, pos)
-            if is_down:
-                break
-        if not is_down and pos[2] < BALL_RADIUS and vel[2] < 0.0:
-            share = (before[2] - BALL_RADIUS) / (before[2] - pos[2]) if before[2] > BALL_RADIUS else 0.0
-            x, y = before[0] + share * (pos[0] - before[0]), before[1] + share * (pos[1] - before[1])
-            is_down = True
-            if x > 0.0:
-                break
-        if pos[2] < _DEEPEST:
-            break
-    return x, y, over_net

@@ -9,7 +9,6 @@ import numpy.typing as npt
 import torch
 
 from common.comms.messages import Episodes, PolicySnapshot, Rollout
-from common.env.hit_corrections import HitCorrections, way_home
 from common.env.rally_env import FinishedRallies, RallyEnv, RallySource
 from common.env.teacher import Teacher, teacher_of
 from common.policy.actor_critic import log_prob
@@ -24,6 +23,7 @@ from common.task.experience import ExperienceConfig
 from common.task.observation import ACTION_SIZE, OBSERVATION, critic_layout, offsets, size
 from common.task.reward import TERMS
 from common.task.states import Outcome
+from services.actor.way_home import way_home
 
 Floats = npt.NDArray[np.float32]
 Flags = npt.NDArray[np.bool_]
@@ -114,7 +114,6 @@ class Player:
         final_index: list[npt.NDArray[np.int32]] = []
         finished: list[FinishedRallies] = []
         corrections = np.zeros((steps, envs, ACTION_SIZE), np.float32)
-        is_given = np.zeros((steps, envs), np.bool_)
         is_taught = self.env.experience.teacher.teaches(snapshot.version)
         if is_taught and self._no_teacher is not None:
             raise self._no_teacher
@@ -134,13 +133,11 @@ class Player:
                 log_mu[t] = log_prob(action, mean, self._network.log_std).numpy()
             actions[t] = action.numpy()
             acted = self._clock()
-            is_given[t] = self._advise(obs[t], actions[t], mean.numpy(), teacher, corrections[t])
+            self._advise(obs[t], actions[t], mean.numpy(), teacher, corrections[t])
             step = self.env.step(actions[t])
             self._obs = step.obs
             rewards[t], terminated[t], truncated[t] = step.reward, step.terminated, step.truncated
             terms += step.terms.sum(axis=0)
-            if not teacher:
-                correct(corrections, t, step.hit_corrections)
             cut = step.truncated[step.ended]
             if cut.any():
                 final_obs.append(step.final_obs[cut])
@@ -169,48 +166,29 @@ class Player:
             last_obs=self._obs.copy(),
             episodes=_episodes(finished),
             reward_terms=terms.astype(np.float32),
-            # No hit correction of a clipped action: its effect differs. The others do not depend on it.
-            corrections=np.where((np.abs(actions) < 1.0) | is_given[..., None], corrections, 0.0),
+            corrections=corrections,
             seconds=MappingProxyType({"inference": inference, "simulation": simulation}),
         )
 
     def _advise(
         self, obs: Floats, actions: Floats, mean: Floats, teacher: Teacher | None, out: Floats
-    ) -> Flags:
-        """Write how the actions of this control step should differ, as far as that is known before it is played.
+    ) -> None:
+        """Write how the actions of this control step should differ.
 
         Args:
             obs: What the policy observes (B, D). It shows a hit late, and only then is the robot led home: a policy
                 that cannot know whether it has hit would begin to leave before.
             actions: To be played (B, 7).
             mean: Of the policy (B, 7).
-            teacher: Whom the policy imitates; None: it learns from rewards and hits.
-            out: Written (B, 7): corrections of the actions by the teacher, of the mean after a hit.
-
-        Returns:
-            The rows that are written (B,).
+            teacher: Whom the policy imitates; None: it learns from rewards.
+            out: Zeros (B, 7); written: corrections of the actions by the teacher, of the mean after a hit.
         """
         has_hit, home = obs[:, _STATE] > 0.0, self.env.home_action
         if teacher:
             out[:] = teacher.advice(self.env) - actions
             out[has_hit] = home - actions[has_hit]  # a teacher may not have learnt the way home
-            return np.ones(len(out), np.bool_)
-        if not self.env.corrects:
-            return np.zeros(len(out), np.bool_)
-        out[has_hit] = way_home(mean[has_hit], home)
-        return has_hit
-
-
-def correct(corrections: Floats, t: int, hits: HitCorrections) -> None:
-    """Write the corrections of the hits in step ``t`` into ``corrections`` (T, B, 7).
-
-    Corrections of frames before the block's start are lost, since those frames have been sent.
-    """
-    for back in range(min(t + 1, hits.corrections.shape[1])):
-        reached = hits.steps > back
-        if not reached.any():
-            return
-        corrections[t - back, hits.rows[reached]] = hits.corrections[reached, back]
+        elif self.env.leads_home:
+            out[has_hit] = way_home(mean[has_hit], home)
 
 
 def _episodes(finished: list[FinishedRallies]) -> Episodes:

@@ -38,7 +38,6 @@ class RallyFeed:
         config: Settings of the actor.
         transport: Connection to the hub.
         member: The actor's membership; counts refused batches.
-        buffer: Filled.
         is_stopping: Whether the actor must stop.
     """
 

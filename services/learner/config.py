@@ -62,7 +62,7 @@ class PPOConfig(BaseModel):
     correction_weight: float = Field(
         500.0,
         ge=0,
-        description="weight of the loss that pulls the mean towards hit corrections or a teacher; 0: PPO alone",
+        description="weight of the loss that pulls the mean action home after hits, or to a teacher's; 0: PPO alone",
     )
     refit_frames: int = Field(
         200_000,
@@ -111,13 +111,6 @@ class CurriculumConfig(BaseModel):
     first_stage: int = Field(1, ge=1, le=3, description="stage to start in; 3 skips the curriculum")
     catch_gate: float = Field(
         0.0, ge=0, le=1, description="leave stage 1 early once this share is caught in training; 0: never"
-    )
-    aiming_log_std: float = Field(
-        -2.5,
-        ge=-5,
-        le=1,
-        description="log of the action noise is at most this as stage 3 begins: hit corrections need strokes "
-        "that the noise does not hide",
     )
     count_reset: Literal["absorbed", "raw"] = Field(
         "absorbed",
@@ -211,7 +204,7 @@ class IntakeConfig(BaseModel):
         return min(self.target_lag, self.max_lag)
 
     def for_actors(self, actors: int) -> Self:
-        """Return the settings with the size of a dataset for so many actors, and a queue of at least two datasets."""
+        """Return the settings for so many actors: a dataset is one rollout of each, and two fit into the queue."""
         rollouts = self.dataset_rollouts or actors
         queue = self.queue_rollouts if self.dataset_rollouts else max(self.queue_rollouts, 2 * rollouts)
         return self.model_copy(update={"dataset_rollouts": rollouts, "queue_rollouts": queue})

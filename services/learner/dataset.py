@@ -175,7 +175,7 @@ def _part(r: Rollout, model: Model, distillation: Distillation, log_std: Tensor)
         ppo.gamma,
         ppo.gae_lambda,
     )
-    # A teacher's last corrections arrive when the policy already learns from rewards. They are not hit corrections.
+    # A teacher's last corrections arrive when the policy already learns from rewards. They are not the way home.
     is_late = distillation.teacher.teaches(r.version) and not distillation.is_on
     corrections = np.zeros_like(r.corrections) if is_late else r.corrections
     return _Part(

@@ -235,12 +235,6 @@ class Intake:
         self._is_updating = True
         return self._in_update
 
-    def take_dataset(self) -> tuple[Queued, ...]:
-        """Return the next dataset of a learner that trains alone, oldest first; () while too few rollouts wait."""
-        if len(self._queue) < self.part and not self._is_updating:
-            return ()
-        return self.take(self.part)
-
     def finish_update(self, learner: LearnerState) -> tuple[Queued, ...]:
         """Record the dataset as trained; return the waiting rollouts that the new version can't use: they are lost."""
         for entry in self._in_update:

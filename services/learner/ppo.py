@@ -165,7 +165,7 @@ def _plan(config: PPOConfig, mode: UpdateMode, share: Share) -> Plan:
         correction=config.correction_weight if learns and share.has_corrections else 0.0,
         most_weight=MAX_WEIGHT,
         has_surrogate=mode is UpdateMode.PPO,
-        # A teacher's correction is relative to the played action, a hit's to the mean action
+        # A teacher's correction is relative to the played action, the way home to the mean action
         from_played=mode is UpdateMode.DISTILL,
     )
     return Plan(

@@ -215,7 +215,7 @@ class Training:
         # While only the critic learns, the policy cannot diverge.
         health = before.health if is_refitting else watched(before.health, rate, self.divergence)
         if changed:
-            self._enter(stage)
+            self.obs_moments = self.obs_moments.recounted()
         self.progress = Progress(
             version=before.version + 1,
             epoch=trained.epochs,
@@ -264,18 +264,6 @@ class Training:
         weight = 1.0 / min(1.0 + (age / AVERAGE_AGE) ** 2, AVERAGE_DATASETS)
         torch._foreach_lerp_(list(self.average.parameters()), list(self.network.parameters()), weight)
 
-    def _enter(self, stage: int) -> None:
-        """Reset the normaliser's count and cap the action noise, for a new stage."""
-        self.obs_moments = self.obs_moments.recounted()
-        if stage == 3:
-            self._cap_log_std(self.curriculum.aiming_log_std)
-
-    @torch.no_grad()
-    def _cap_log_std(self, log_std: float) -> None:
-        """Bound the log standard deviation of actions from above."""
-        for network in (self.network, self.average):
-            network.log_std.clamp_(max=log_std)
-
     def forget_health(self) -> None:
         """Start the stage's measure again."""
         self.progress = replace(self.progress, health=Health())
@@ -294,7 +282,7 @@ class Training:
         load(self)
         then = self.progress
         if is_other_stage := then.stage_number != now.stage_number:
-            self._enter(now.stage)
+            self.obs_moments = self.obs_moments.recounted()
         self.progress = replace(
             now,
             learning_rate=max(0.5 * now.learning_rate, self.ppo.learning_rate_min),

@@ -320,7 +320,7 @@ def test_every_rally_is_played_to_its_end_by_default(settings, shares):
 
     experience = env._batch.env.experience
     assert (experience.end_at_hit_share, experience.continue_share) == shares
-    assert not experience.hit_correction
+    assert not experience.leads_home
 
 
 @pytest.mark.parametrize("observation", [ObservationConfig(), {"history": 4}, PAPER_OBSERVATION])

@@ -47,10 +47,9 @@ def test_an_arm_differs_from_the_curriculum_in_what_it_names_alone(arm, named):
 def test_no_arm_has_what_acts_in_stage_3_alone():
     for arm in ARMS:
         found = settings_of(arm)
-        assert found["experience.hit_correction"] is False
+        assert found["experience.leads_home"] is False
         assert found["task.reward.landing_bonus"] == 0
         assert found["learner.curriculum.stage_shares"] == [0.14, 0.48, 0.38]
-        assert found["learner.curriculum.aiming_log_std"] == 1.0
 
 
 def finished(training: Wanted, returned, balls=2000, collision="tailored"):

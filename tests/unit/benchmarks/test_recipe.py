@@ -88,7 +88,7 @@ def test_other_runs_are_grouped_by_what_their_settings_differ_in():
     found = rungs(
         [
             finished("a"),
-            finished("b", *clip, "--experience.hit-correction", "true"),
+            finished("b", *clip, "--experience.leads-home", "true"),
             finished("c", *clip),
             finished("d", *clip, "--seed", "1"),
             finished("e", "--recipe", "paper-50hz"),
@@ -99,7 +99,7 @@ def test_other_runs_are_grouped_by_what_their_settings_differ_in():
     assert {rung["label"]: [run["run"] for run in rung["runs"]] for rung in found["ladder"]} == {
         "paper": ["f"],
         "default": ["a"],
-        "paper with experience.hit_correction true, learner.ppo.clip 0.1": ["b"],
+        "paper with experience.leads_home true, learner.ppo.clip 0.1": ["b"],
         "paper with learner.ppo.clip 0.1": ["c", "d"],
         "paper-50hz": ["e"],
     }

@@ -15,7 +15,7 @@ from common.comms.messages import ActorReport, Rollout
 from common.comms.transport import Flow
 from services.learner.admission import Header
 from services.learner.config import PPOConfig
-from tests.unit.services.accounting import LEARNER_STATE, make_intake
+from tests.unit.services.accounting import LEARNER_STATE, make_intake, take_dataset
 
 KEYS = Keys(LEARNER_STATE.run)
 
@@ -55,7 +55,7 @@ def test_light_senders_keep_to_the_actors_protocol(broker):
             verdict = intake.arrive(header_of(rollout), rollout, turn * 1.0)
             verdicts.append(verdict.kind.value)
             request.reply(encode(verdict))
-        if dataset := intake.take_dataset():
+        if dataset := take_dataset(intake):
             assert len(dataset) == 4
             version += 1
             intake.finish_update(replace(LEARNER_STATE, version=version))

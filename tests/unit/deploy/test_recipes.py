@@ -50,7 +50,7 @@ def test_the_papers_recipe_has_none_of_our_additions():
     ppo, experience = config.learner.ppo, config.experience
 
     assert (ppo.correction_weight, ppo.refit_frames, ppo.entropy_weight) == (0.0, 0, 0.0)
-    assert (experience.hit_correction, experience.teacher.policy) == (False, "")
+    assert (experience.leads_home, experience.teacher.policy) == (False, "")
     assert (experience.continue_share, experience.end_at_hit_share) == (0.0, 0.0)
     assert config.learner.divergence.collapse == 0.0
     assert config.learner.evaluated_weights == "newest"

@@ -208,7 +208,7 @@ def test_a_match_plays_every_rally_to_its_end(scripted_returns):
 
     experience = scripted_returns[-1].experience
     assert (experience.end_at_hit_share, experience.continue_share) == (0.0, 0.0)
-    assert not experience.hit_correction
+    assert not experience.leads_home
 
 
 def test_a_match_is_the_contracts_task_under_the_matchs_conditions():

@@ -7,7 +7,8 @@ from benchmarks.fuzz.message_examples import make_rollout
 from common.comms.messages import Verdict, VerdictKind
 from services.learner.admission import Header, LearnerState
 from services.learner.config import IntakeConfig
-from services.learner.intake import Intake
+from services.learner.intake import Intake, Queued
+from services.learner.turns import Rank, taken
 
 LEARNER_STATE = LearnerState(
     run="night", generation=1, version=10, stage_number=2, stage=3, training_hash="c0ffee"
@@ -31,6 +32,12 @@ def make_header(sequence: int = 0, **changes: Any) -> Header:
 
 def make_intake(*, learner: LearnerState = LEARNER_STATE, **settings: Any) -> Intake:
     return Intake(IntakeConfig(**{"dataset_rollouts": 4, **settings}), learner)
+
+
+def take_dataset(intake: Intake) -> tuple[Queued, ...]:
+    """Return the next dataset of a learner that trains alone; () while too few rollouts wait."""
+    (count,) = taken([Rank(intake.queued, 1, 1, 0)], intake.part)
+    return intake.take(count) if count else ()
 
 
 def make_verdict(kind: VerdictKind, **changes: Any) -> Verdict:

@@ -17,7 +17,7 @@ from services.learner.admission import Header, LearnerState
 from services.learner.config import IntakeConfig
 from services.learner.intake import Intake, Queued
 from services.learner.ledger import AccountSnapshot, Ledger
-from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header
+from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, take_dataset
 
 OUTBOX = OutboxConfig(retry_first_s=1.0, retry_max_s=4.0, give_up_s=30.0)
 INTAKE = IntakeConfig(dataset_rollouts=2, max_lag=1, queue_rollouts=3)
@@ -214,7 +214,7 @@ class World(RuleBasedStateMachine):
     def start_update(self) -> None:
         if self.dataset:
             return
-        self.dataset = self.intake.take_dataset()
+        self.dataset = take_dataset(self.intake)
         for entry in self.dataset:
             assert key_of(entry.header) not in self.trained, "trained twice"
             assert self.intake.learner.version - entry.header.version <= INTAKE.max_lag
@@ -344,7 +344,7 @@ def test_paced_actors_fill_every_dataset_without_a_refusal_and_within_the_lag(ma
         now += 1.0
         for actor in crew:
             play(actor, intake, now)
-        dataset = intake.take_dataset()
+        dataset = take_dataset(intake)
         lags += [intake.learner.version - entry.header.version for entry in dataset]
         for actor in crew:  # the update runs meanwhile
             play(actor, intake, now)
@@ -378,4 +378,4 @@ def test_a_silent_actors_credits_do_not_block_a_synchronous_run():
     for second in range(60):
         play(eager, intake, float(second))
 
-    assert len(intake.take_dataset()) == 4
+    assert len(take_dataset(intake)) == 4

@@ -5,7 +5,6 @@ import pytest
 from pydantic import ValidationError
 
 from common.env.rally_env import RallyEnv
-from common.rally.hit_correction import HIT
 from common.task.config import TaskConfig
 from common.task.experience import MATCH, ExperienceConfig, TeacherConfig
 from common.task.launch import draw_rallies
@@ -13,8 +12,8 @@ from common.task.states import State
 from tests.unit.env.rallies import Deck, random_actions
 
 
-def test_a_match_has_no_second_rally_no_early_end_no_correction_and_no_teacher():
-    assert (MATCH.continue_share, MATCH.end_at_hit_share, MATCH.hit_correction) == (0.0, 0.0, False)
+def test_a_match_has_no_second_rally_no_early_end_no_way_home_and_no_teacher():
+    assert (MATCH.continue_share, MATCH.end_at_hit_share, MATCH.leads_home) == (0.0, 0.0, False)
     assert not MATCH.teacher.policy
 
 
@@ -28,10 +27,8 @@ def test_a_match_plays_every_rally_to_its_end():
         step = env.step(action)
 
         np.testing.assert_array_equal(step.ended, step.finished.rows)
-        assert step.hit_corrections.rows.size == 0
         flights_after_the_hit += (env.rallies.state == State.TAU_23).sum()
 
-    assert env.rallies.hit.shape == (0, HIT)
     assert flights_after_the_hit > 10
 
 
@@ -48,11 +45,11 @@ def test_training_ends_and_continues_the_shares_of_episodes_that_it_is_set_to():
     assert not (continues & env.rallies.ends_at_hit).any()
 
 
-def test_the_defaults_end_four_of_five_episodes_at_the_hit_and_correct_hits():
+def test_the_defaults_end_four_of_five_episodes_at_the_hit_and_lead_home():
     experience = ExperienceConfig()
 
     assert (experience.continue_share, experience.end_at_hit_share) == (0.4, 0.8)
-    assert experience.hit_correction
+    assert experience.leads_home
     assert experience.teacher == TeacherConfig()
 
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from common.comms.messages import PolicySnapshot
-from common.env.hit_corrections import NO_HIT_CORRECTIONS, HitCorrections
 from common.env.rally_env import Launches
 from common.env.robot import home_action
 from common.policy.config import NetworkConfig
@@ -15,12 +14,11 @@ from common.policy.folder import load_policy
 from common.policy.network_pass import native_precision
 from common.policy.normalizer import normalize
 from common.policy.weights import new_network, observation_moments, pack
-from common.rally.hit_correction import BACK
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.launch import draw_rallies
 from common.task.observation import critic_layout, offsets, policy_layout, size
-from services.actor.player import Player, correct
+from services.actor.player import Player
 from tests.unit.env.teachers import write_teacher
 
 ENVS, HORIZON = 6, 40
@@ -179,58 +177,15 @@ def test_a_policy_of_another_task_or_with_unusable_weights_is_refused_and_the_ol
         assert torch.equal(value, before[name])
 
 
-def make_hits(*hits, seed=0):
-    """Return hit_corrections of random numbers for (row, steps)."""
-    rng = np.random.default_rng(seed)
-    rows, steps = np.array(hits).T
-    return HitCorrections(rows, rng.normal(size=(len(rows), BACK, 7)).astype(np.float32), steps)
-
-
-def test_a_correction_is_at_its_control_step_and_robot():
-    corrections = np.zeros((20, 4, 7), np.float32)
-    hit_corrections = make_hits((2, BACK), (0, 3))
-    correct(corrections, 15, hit_corrections)
-    expected = np.zeros_like(corrections)
-    for k, (row, steps) in enumerate([(2, BACK), (0, 3)]):
-        for back in range(steps):
-            expected[15 - back, row] = hit_corrections.corrections[k, back]
-
-    np.testing.assert_array_equal(corrections, expected)
-
-
-def test_corrections_before_the_blocks_start_are_lost():
-    corrections = np.zeros((20, 4, 7), np.float32)
-    hit_corrections = make_hits((1, BACK))
-    correct(corrections, 2, hit_corrections)
-
-    np.testing.assert_array_equal(corrections[[2, 1, 0], 1], hit_corrections.corrections[0, :3])
-    np.testing.assert_array_equal(corrections[3:], 0.0)
-
-
-def test_a_step_without_hits_leaves_the_corrections():
-    corrections = np.ones((20, 4, 7), np.float32)
-    correct(corrections, 15, NO_HIT_CORRECTIONS)
-
-    np.testing.assert_array_equal(corrections, 1.0)
-
-
-def struck_block(monkeypatch, stage=3, **experience):
-    """Return a block of 512 robots near home, some of which the ball hits, and the hit corrections by step."""
+def struck_block(stage=3, **experience):
+    """Return a block of 512 robots near home, some of which the ball hits."""
     player = Player(CONFIG, ExperienceConfig(**experience), NETWORK, Dealer(), 512, HORIZON, 1)
     torch.manual_seed(0)
     network = new_network(NETWORK, OBSERVATION, player.env.home_action)
     with torch.no_grad():
-        network.mean.bias[0] = 1.2  # the first joint's action is clipped, and gets no correction
+        network.mean.bias[0] = 1.2  # the first joint's action is clipped
     player.adopt(make_snapshot(player, stage=stage, weights=pack(network)))
-    hit_corrections, step = [], player.env.step
-
-    def recorded(actions):
-        result = step(actions)
-        hit_corrections.append(result.hit_corrections)
-        return result
-
-    monkeypatch.setattr(player.env, "step", recorded)
-    return player.play("a", 9, 3), hit_corrections
+    return player.play("a", 9, 3)
 
 
 def shows_a_hit(block):
@@ -238,27 +193,8 @@ def shows_a_hit(block):
     return block.obs[..., offsets(critic_layout(OBSERVATION))["trajectory_state"].start] > 0.0
 
 
-def test_a_blocks_corrections_are_its_hits_except_where_an_action_was_clipped(monkeypatch):
-    block, hit_corrections = struck_block(monkeypatch)
-    expected = np.zeros_like(block.corrections)
-    for t, hits in enumerate(hit_corrections):
-        for row, correction, steps in zip(hits.rows, hits.corrections, hits.steps, strict=True):
-            for back in range(min(steps, t + 1)):
-                for joint in range(7):
-                    if abs(block.actions[t - back, row, joint]) < 1.0:
-                        expected[t - back, row, joint] = correction[back, joint]
-                    else:
-                        expected[t - back, row, joint] = 0.0
-
-    assert sum(hits.rows.size for hits in hit_corrections) > 3
-    assert block.corrections.dtype == np.float32
-    assert (np.abs(block.actions) >= 1.0).any()
-    before = ~shows_a_hit(block)  # from then on the robot is led home
-    np.testing.assert_array_equal(block.corrections[before], expected[before])
-
-
-def test_after_its_hit_a_robot_is_led_home_in_small_steps_whatever_was_clipped(monkeypatch):
-    block, _ = struck_block(monkeypatch, end_at_hit_share=0.0)
+def test_after_its_hit_a_robot_is_led_home_in_small_steps_whatever_was_clipped():
+    block = struck_block(end_at_hit_share=0.0)
     has_hit = shows_a_hit(block)
     led = block.corrections[has_hit]
     home = home_action("rails")
@@ -268,11 +204,12 @@ def test_after_its_hit_a_robot_is_led_home_in_small_steps_whatever_was_clipped(m
     # the first joint's mean is 1.2 beyond home, and the others' are near it
     assert (led[:, 0] < -0.015).all()
     assert home[0] < 1.0
+    np.testing.assert_array_equal(block.corrections[~has_hit], 0.0)  # before, rewards alone say what to do
 
 
-@pytest.mark.parametrize(("stage", "changes"), [(1, {}), (2, {}), (3, {"hit_correction": False})])
-def test_without_hit_correction_and_outside_stage_3_there_are_no_corrections(monkeypatch, stage, changes):
-    block, _ = struck_block(monkeypatch, stage, **changes)
+@pytest.mark.parametrize(("stage", "changes"), [(1, {}), (2, {}), (3, {"leads_home": False})])
+def test_outside_stage_3_and_where_it_is_off_no_robot_is_led_home(stage, changes):
+    block = struck_block(stage, **changes)
 
     assert block.episodes.caught.any()
     assert block.corrections.shape == block.actions.shape

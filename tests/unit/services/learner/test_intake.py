@@ -16,7 +16,7 @@ from services.learner.config import IntakeConfig
 from services.learner.intake import IDLE_REPORTS_HZ, SOONEST_REPORT_S, Intake
 from services.learner.ledger import Account, AccountSnapshot, Fate, Ledger, restored
 from tests.unit.comms.test_codec import sealed
-from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake
+from tests.unit.services.accounting import LEARNER_STATE, ROLLOUT, make_header, make_intake, take_dataset
 from tests.unit.services.learner.rollouts import make_rollout as make_full_rollout
 
 LIMIT = 2**20
@@ -56,7 +56,7 @@ def test_every_kind_of_verdict_on_a_rollout_has_its_rule():
 def test_a_report_of_a_life_whose_account_is_closed_gets_a_verdict_of_its_own():
     intake = make_intake(dataset_rollouts=1)
     intake.arrive(make_header(0), ROLLOUT, 0.0)
-    intake.take_dataset()
+    take_dataset(intake)
     intake.finish_update(LEARNER_STATE)
     said = make_report(Outbox(OutboxConfig(), next_sequence=1, generation=1))
     intake.gone(said.actor, said.incarnation)
@@ -72,7 +72,7 @@ def test_a_retry_gets_the_recorded_verdict_whatever_has_changed_since():
     intake = make_intake(dataset_rollouts=1)
     intake.arrive(make_header(0), ROLLOUT, 0.0)
     intake.arrive(make_header(1, stage_number=1), ROLLOUT, 0.0)
-    intake.take_dataset()
+    take_dataset(intake)
     intake.finish_update(dataclasses.replace(LEARNER_STATE, version=50, stage_number=3))
 
     accepted, refused = (
@@ -90,7 +90,7 @@ def test_a_full_queue_is_busy_and_leaves_the_verdict_open():
     intake.arrive(make_header(0), ROLLOUT, 0.0)
 
     assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.BUSY
-    intake.take_dataset()
+    take_dataset(intake)
     assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.ACCEPTED
 
 
@@ -105,7 +105,7 @@ def test_lag_is_counted_to_the_version_at_use():
 def test_with_no_lag_allowed_nothing_is_accepted_during_an_update():
     intake = make_intake(dataset_rollouts=1, max_lag=0)
     intake.arrive(make_header(0), ROLLOUT, 0.0)
-    intake.take_dataset()
+    take_dataset(intake)
 
     assert intake.arrive(make_header(1), ROLLOUT, 0.0).kind is VerdictKind.TOO_OLD
 
@@ -113,19 +113,19 @@ def test_with_no_lag_allowed_nothing_is_accepted_during_an_update():
 def test_datasets_are_complete_in_order_and_one_at_a_time():
     intake = make_intake(dataset_rollouts=2)
     intake.arrive(make_header(0), ROLLOUT, 0.0)
-    assert intake.take_dataset() == ()
+    assert take_dataset(intake) == ()
     intake.arrive(make_header(1), ROLLOUT, 0.0)
 
-    assert [entry.header.sequence for entry in intake.take_dataset()] == [0, 1]
+    assert [entry.header.sequence for entry in take_dataset(intake)] == [0, 1]
     with pytest.raises(RuntimeError, match="an update of 2 rollouts is running"):
-        intake.take_dataset()
+        intake.take(2)
 
 
 def test_rollouts_that_wait_at_a_stage_change_are_lost_and_counted():
     intake = make_intake(dataset_rollouts=1)
     for sequence in range(3):
         intake.arrive(make_header(sequence), ROLLOUT, 0.0)
-    intake.take_dataset()
+    take_dataset(intake)
     intake.finish_update(dataclasses.replace(LEARNER_STATE, version=11, stage_number=3))
 
     ledger = intake.ledgers()["actor-0", 1]
@@ -220,7 +220,7 @@ def test_nothing_is_collected_for_the_time_after_a_stage_change():
     intake = make_intake(learner=learner, dataset_rollouts=1, max_lag=2)
 
     assert intake.arrive(make_header(0), ROLLOUT, 0.0).credit_limit == 0
-    intake.take_dataset()
+    take_dataset(intake)
     assert intake.arrive(make_header(1), ROLLOUT, 0.0).credit_limit == 0
 
 
@@ -258,7 +258,7 @@ def test_a_checkpoint_keeps_every_outcome_and_queued_rollouts_are_lost():
     for sequence in (0, 1, 2, 5):
         intake.arrive(make_header(sequence), ROLLOUT, 0.0)
     intake.arrive(make_header(6, stage_number=0), ROLLOUT, 0.0)
-    intake.take_dataset()
+    take_dataset(intake)
     intake.finish_update(dataclasses.replace(LEARNER_STATE, version=11))
 
     accounts = [
@@ -300,7 +300,7 @@ def test_rollouts_that_wait_at_a_planned_stop_are_trained_by_the_next_learner():
     again = kept(intake)
     assert again.total().in_flight == 1
     again.arrive(make_header(1, generation=2), ROLLOUT, 0.0)
-    dataset = again.take_dataset()
+    dataset = take_dataset(again)
     again.finish_update(dataclasses.replace(again.learner, version=11))
 
     assert [entry.header.sequence for entry in dataset] == [0, 1]
@@ -401,7 +401,7 @@ def test_earlier_lives_are_one_account_and_the_total_stays():
         header = make_header(0, incarnation=life)
         intake.arrive(header, ROLLOUT, 0.0)
         intake.arrive(dataclasses.replace(header, sequence=3, stage_number=0), ROLLOUT, 0.0)
-        if intake.take_dataset():
+        if take_dataset(intake):
             intake.finish_update(intake.learner)
         intake.gone("actor-0", life)
     before = intake.total()

@@ -18,7 +18,7 @@ from tests.unit.services.learner.rollouts import ROLLOUT_FRAMES, make_rollout
 
 NETWORK = NetworkConfig(units=(16, 8))
 FLAGS = (
-    *("--network.units", "16,8", "--curriculum.first-stage", "3", "--experience.hit-correction", "false"),
+    *("--network.units", "16,8", "--curriculum.first-stage", "3", "--experience.leads-home", "false"),
     *("--ppo.minibatch", "64", "--ppo.mini-epochs", "2", "--ppo.precision", "float32"),
 )
 

@@ -358,28 +358,6 @@ def test_after_distillation_a_policy_learns_from_rewards_with_small_steps_and_no
     assert after.policy_loss != 0.0
 
 
-@pytest.mark.parametrize("aiming_log_std", [-2.5, -1.0])
-def test_the_action_noise_is_bounded_from_stage_3_on_and_not_before(aiming_log_std):
-    curriculum = CURRICULUM.model_copy(update={"aiming_log_std": aiming_log_std})
-    training = Training(
-        PPO, NetworkConfig(units=(16, 8)), StageLengths(curriculum), np.zeros(7, np.float32), 0
-    )
-    noises = {}
-    for epoch in range(6):
-        stage = training.run_epoch(dataset(epoch)).progress.stage
-        noises[stage] = [n.log_std.detach().clone() for n in (training.network, training.average)]
-        if stage == 3:
-            break
-
-    for before, after in zip(noises[2], noises[3], strict=True):
-        assert (before > -2.0).all()
-        if aiming_log_std == -2.5:
-            assert (after == -2.5).all()
-        else:  # smaller noise stays as it is
-            assert (after < -1.0).all()
-            assert (after > -2.0).all()
-
-
 def test_two_threads_reach_what_one_reaches():
     before = torch.get_num_threads()
     trained = []

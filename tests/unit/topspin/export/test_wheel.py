@@ -24,7 +24,7 @@ IN_THE_WHEEL = {
     "nominal_motion spin_posterior",
     "common.physics": "__init__ chain constants exponential flight flight_model fly impulse racket_bounce table_bounce "
     "touch vec",
-    "common.rally": "__init__ hit_correction observe observer sensing state",
+    "common.rally": "__init__ hit observe observer sensing state",
     "common.task": "__init__ config counter_rng landing_point launch_presets observation randomization reward states",
     "topspin.robot": "__init__ __main__ contract controller faults made_up_ball network ros2 tracker",
 }
