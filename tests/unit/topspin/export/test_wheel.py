@@ -22,10 +22,10 @@ IN_THE_WHEEL = {
     "common": "__init__ errors jit",
     "common.perception": "__init__ bounce_prediction camera camera_filter cholesky flight_filter flight_track "
     "nominal_motion spin_posterior",
-    "common.physics": "__init__ chain constants exponential flight flight_model fly impulse racket_bounce table_bounce "
+    "common.physics": "__init__ chain constants exponential flight flight_model fly impulse table_bounce "
     "touch vec",
     "common.rally": "__init__ hit observe observer sensing state",
-    "common.task": "__init__ config counter_rng landing_point launch_presets observation randomization reward states",
+    "common.task": "__init__ config counter_rng launch_presets observation randomization reward states",
     "topspin.robot": "__init__ __main__ contract controller faults made_up_ball network ros2 tracker",
 }
 BLOCKED = ("torch", "mujoco", "topspin", "common", "gymnasium", "zenoh", "safetensors", "msgpack")
