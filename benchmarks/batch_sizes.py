@@ -32,7 +32,7 @@ from common.service.whole_file import write_whole
 HORIZON: Final = 32  # control steps of a rollout
 FEWEST_ACTORS: Final = 2
 MINIBATCHES: Final = 4  # of a dataset, as the law assumes
-RULE: Final = attrgetter("dataset", "minibatch", "more")
+TRAINING: Final = attrgetter("dataset", "minibatch", "more", "seed")  # what makes a point another one
 LARGEST_ROLLOUT: Final = 131_072  # frames: 26 MB, and a message may have 64 MiB
 
 
@@ -133,7 +133,7 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
             more=config.more,
         )
         # It takes the place of one that missed the goal with fewer frames
-        others = [one for one in points if (*RULE(one), one.seed) != (*RULE(point), seed)]
+        others = [one for one in points if TRAINING(one) != TRAINING(point)]
         points = (*others, point)
         write_whole(config.out, LargeBatches(**goal, points=points).model_dump_json(indent=1) + "\n")
         print(f"dataset {size}  seed {seed}  frames {point.frames}", file=sys.stderr, flush=True)

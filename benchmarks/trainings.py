@@ -106,8 +106,9 @@ def make(wanted: Iterable[Wanted], stop: Event, trains: bool = True) -> list[str
         if stop.is_set():
             break
         try:
-            made(one)
             fault = _train(one, stop) if trains else ""
+            if not trains:
+                made(one)
         except ReportedError as error:  # the others are made all the same
             fault = str(error)
         if fault:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.live import Live
 
 from common.comms.messages import Status
+from common.comms.roles import name_of
 from common.comms.transport import Transport, TransportError
 from common.service.log import set_up_logging
 from common.service.process import DONE, INTERRUPTED
@@ -74,7 +75,7 @@ def watch(
         )
         run.folder.wanted_actors.unlink(missing_ok=True)  # of an earlier life
         # The supervisor has a group of learners as one child
-        followers = [f"learner-{rank}" for rank in range(1, run.config.learners)]
+        followers = [name_of("learner", str(rank)) for rank in range(1, run.config.learners)]
         while not stop.is_set() and not supervisor.has_ended(LEARNER):
             now = time.monotonic()
             supervisor.watch(now)

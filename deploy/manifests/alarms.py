@@ -6,9 +6,11 @@ On a healthy run every signal has data and no alarm fires; a test asks a real Pr
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from common.service.member import LEARNER_ID
+
 WAIT_SHARE: Final = "topspin_learner_wait_share"
 """Name of the learner's hunger, which a rule records, and by which actors can be scaled."""
-LEADER: Final = 'role="learner",id="0"'
+LEADER: Final = f'role="learner",id="{LEARNER_ID}"'
 """Labels of the learner that leads: of a group, it counts the frames of all."""
 WAIT_SHARE_QUERY: Final = f'1 - rate(topspin_phase_seconds_total{{{LEADER},phase="update"}}[2m])'
 

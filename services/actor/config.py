@@ -11,6 +11,7 @@ from common.task.experience import ExperienceConfig
 
 ENVS: Final = 256  # environments that the actors of a run share
 FEWEST_ENVS: Final = 16  # of each actor
+IDLE_WAIT_S: Final = 0.05  # between two looks for messages, while an actor waits
 
 
 class OutboxConfig(BaseModel):

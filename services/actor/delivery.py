@@ -11,7 +11,7 @@ from common.service.history import History
 from common.service.member import Member
 from common.service.metrics import Metrics
 from services.actor import outbox as box
-from services.actor.config import ActorConfig
+from services.actor.config import IDLE_WAIT_S, ActorConfig
 from services.actor.player import Player
 from services.actor.policy_feed import PolicyFeed
 
@@ -23,7 +23,6 @@ REPORT_INTERVAL_S: Final = (
 REPORT_TIMEOUT_S: Final = 5.0
 LAST_VERDICTS_S: Final = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S: Final = 2.0
-WAIT_S: Final = 0.05
 REFUSALS: Final = frozenset(VerdictKind) - {
     *(VerdictKind.ACCEPTED, VerdictKind.DUPLICATE, VerdictKind.BUSY),
     *(VerdictKind.CREDITS, VerdictKind.LIFE_ENDED),
@@ -138,7 +137,7 @@ class Delivery:
         self.outbox = box.at_once(self.outbox, now)  # a rollout that waits for its next try is sent now
         while self.outbox.flights and now < deadline:
             self.send(now)
-            self._transport.wait(WAIT_S)
+            self._transport.wait(IDLE_WAIT_S)
             now = time.monotonic()
             self._policies.note_learners()
             self.take_verdicts(now)

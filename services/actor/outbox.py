@@ -131,10 +131,9 @@ def answered(outbox: Outbox, sequence: int, verdict: Verdict, now: float) -> Out
     counts = dict(outbox.refused_by_kind)
     counts[refusal.kind] = counts.get(refusal.kind, 0) + 1
     # Apart, since a report lists those of earlier learners alone
-    old, own = (
-        [r for r in outbox.refused if (r.generation == refusal.generation) is own] for own in (False, True)
-    )
-    newest = (*old[-LISTED_REFUSALS:], *own[-LISTED_REFUSALS + 1 :], refusal)
+    own = [*(r for r in outbox.refused if r.generation == refusal.generation), refusal]
+    others = [r for r in outbox.refused if r.generation != refusal.generation]
+    newest = (*others[-LISTED_REFUSALS:], *own[-LISTED_REFUSALS:])
     return replace(outbox, flights=rest, refused_by_kind=tuple(sorted(counts.items())), refused=newest)
 
 

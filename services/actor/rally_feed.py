@@ -12,12 +12,11 @@ from common.comms.messages import RallyBatch, RallyRequest
 from common.comms.transport import Flow, Reply, Subscription, Transport
 from common.errors import ReportedError
 from common.service.member import Member
-from services.actor.config import ActorConfig
+from services.actor.config import IDLE_WAIT_S, ActorConfig
 from services.actor.rally_buffer import RallyBuffer, launch_fault
 
 log = logging.getLogger(__name__)
 
-IDLE_WAIT_S: Final = 0.05
 RALLY_BATCHES: Final = 8  # that wait until the ring has room for them
 MOST_RANDOM: Final = 0.05  # [-] share of random launches in a block above which the log warns
 REQUEST_RALLIES_S: Final = 2.0  # limit of one request for a block

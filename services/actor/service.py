@@ -13,7 +13,7 @@ from common.service.member import Member
 from common.service.metrics import Metrics
 from common.task.counter_rng import Stream, bits
 from services.actor import outbox as box
-from services.actor.config import ActorConfig
+from services.actor.config import IDLE_WAIT_S, ActorConfig
 from services.actor.delivery import Delivery
 from services.actor.following import no_learner
 from services.actor.player import Player
@@ -23,7 +23,6 @@ from services.actor.rally_feed import RallyFeed, StopRequested
 
 log = logging.getLogger(__name__)
 
-IDLE_WAIT_S: Final = 0.05
 MOST_REASONS: Final = 16  # of waiting, that the log names while an actor is idle
 
 

@@ -23,7 +23,7 @@ def next_generation(file: Path, in_checkpoint: int) -> int:
     """Return the generation of a learner that starts now, and record it in the run folder's ``file``."""
     try:
         recorded = int(file.read_text(encoding="ascii"))
-    except (OSError, ValueError):  # a new run
+    except (OSError, ValueError):  # a new run, or a damaged file
         recorded = 0
     found = following(max(recorded, in_checkpoint), secrets.randbits(NOISE_BITS))
     write_whole(file, f"{found}\n")

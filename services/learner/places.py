@@ -69,9 +69,8 @@ class Places:
             unknown = present - self._given.keys() - {name}
             taken |= {own for other in unknown if (own := number_in(other)) is not None}
             wish = number_in(name)
-            number = wish if wish is not None else 0
-            if number in taken or wish is None:
-                number = next(k for k in count() if k not in taken and (name or str(k) not in present))
+            free = (k for k in count() if k not in taken and (name or str(k) not in present))
+            number = next(free) if wish is None or wish in taken else wish
             if wish not in (None, number):
                 log.warning("actor=%s gets the number %d: another actor has %d", name, number, wish)
         name = name or str(number)

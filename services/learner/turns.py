@@ -40,9 +40,9 @@ def taken(ranks: Sequence[Rank], dataset: int) -> tuple[int, ...]:
     # others lack: one of each in turn, so that the work is divided as evenly as it can be
     for most in (parts(ranks, dataset), [rank.queued for rank in ranks]):
         room = [min(limit, rank.queued) for limit, rank in zip(most, ranks, strict=True)]
-        while missing and counts != [max(pair) for pair in zip(counts, room, strict=True)]:
-            for number in range(len(ranks)):
-                if missing and counts[number] < room[number]:
+        for _ in range(max(room)):
+            for number, limit in enumerate(room):
+                if missing and counts[number] < limit:
                     counts[number] += 1
                     missing -= 1
     return tuple(counts)
