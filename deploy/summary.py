@@ -4,9 +4,9 @@ import logging
 import shlex
 from collections.abc import Mapping
 from threading import Event
-from typing import Any, Final
+from typing import Any
 
-from common.comms.messages import Status
+from common.comms.messages import FATES, Status
 from common.evaluation.config import MatchConfig
 from common.evaluation.evaluate import StoppedError, check, measure
 from common.policy.folder import load_policy
@@ -16,8 +16,6 @@ from deploy.panel import written
 from deploy.prepare import PreparedRun, last_epoch
 
 log = logging.getLogger(__name__)
-
-FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")
 
 
 def run_summary(run: PreparedRun, learner: Status | None) -> dict[str, Any]:

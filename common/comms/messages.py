@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -304,6 +304,10 @@ class Place:
     actor: Id
     index: Count  # its number: it decides the action noise and the shard of rallies
     settings: bytes  # TOML: what must be as the learner has it
+
+
+FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")
+"""Counters of a learner's heartbeat: where rollouts are. The first is the sum of the others."""
 
 
 @dataclass(frozen=True, slots=True)

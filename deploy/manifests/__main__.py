@@ -1,5 +1,6 @@
 """Write the files of deploy/monitoring and deploy/cluster again: `python -m deploy.manifests`."""
 
+import argparse
 import sys
 
 from deploy.manifests.files import FOLDER, files
@@ -7,6 +8,7 @@ from deploy.manifests.files import FOLDER, files
 
 def main() -> int:
     """Write all files; return the exit status."""
+    argparse.ArgumentParser(prog="python -m deploy.manifests", description=__doc__).parse_args()
     for name, text in files().items():
         path = FOLDER / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -139,8 +139,3 @@ def play_counts(rollouts: Sequence[Rollout]) -> npt.NDArray[np.float64]:
             terms if terms.size else np.zeros(len(TERMS)),
         ]
     )
-
-
-def play_stats(rollouts: Sequence[Rollout]) -> PlayStats:
-    """Return the counts over the rallies that ended in ``rollouts``."""
-    return merged(play_counts(rollouts)[None])

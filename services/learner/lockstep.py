@@ -8,9 +8,10 @@ from typing import Any, Final
 import numpy as np
 
 from common.comms.codec import encode
+from common.comms.messages import FATES
 from services.learner.group import Group
 from services.learner.intake import Intake, Queued
-from services.learner.telemetry import FATES, fates
+from services.learner.telemetry import fates
 from services.learner.turns import Rank, parts, taken
 
 SOON_S: Final = 0.001  # longest wait between two looks for the other ranks

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from common.comms.messages import VerdictKind
+from common.comms.messages import FATES, VerdictKind
 from common.service.metrics import Metrics
 from common.task.reward import TERMS
 from common.task.states import Outcome
@@ -87,9 +87,6 @@ def measure_update(metrics: Metrics, update_s: float) -> None:
     """Put the duration of an update [s] into the metrics, also of a learner that does not lead."""
     metrics.inc("topspin_phase_seconds_total", update_s, phase="update")
     metrics.observe("topspin_update_seconds", update_s)
-
-
-FATES: Final = ("published", "trained", "refused", "dropped", "in_flight", "lost")
 
 
 def fates(ledger: Ledger) -> dict[str, int]:

@@ -1,5 +1,6 @@
 """Write docs/reference again: `python -m topspin.reference`."""
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from topspin.reference.files import FOLDER, files
 
 def main() -> int:
     """Write all files; return the exit status."""
+    argparse.ArgumentParser(prog="python -m topspin.reference", description=__doc__).parse_args()
     for name, text in files().items():
         (Path(FOLDER) / name).write_text(text, encoding="utf-8")
         sys.stdout.write(f"{FOLDER}/{name}\n")

@@ -11,7 +11,7 @@ import services.learner.scalars as scalars_module
 from common.errors import ConfigError, ReportedError
 from common.service.table import Table, whole_rows
 from services.evaluator.service import CURVE
-from services.learner.epoch_stats import EpochStats, Progress, play_stats
+from services.learner.epoch_stats import EpochStats, Progress, merged, play_counts
 from services.learner.ppo import UpdateStats
 from services.learner.run_log import RunLog, RunLogError, row
 from services.learner.scalars import own_writers, scalars
@@ -105,7 +105,7 @@ def test_a_file_that_is_no_table_of_epochs_is_refused_and_stays(tmp_path):
 
 def test_every_column_of_a_row_is_a_curve_once_and_no_name_says_its_group_twice():
     update = UpdateStats(*[0.5] * 11, True)
-    stats = EpochStats(Progress(), update, play_stats([make_rollout()]), False, "", 0.0, 1)
+    stats = EpochStats(Progress(), update, merged(play_counts([make_rollout()])[None]), False, "", 0.0, 1)
     values = row(stats, 1.0, 2.0)
     names = scalars(dict.fromkeys(values, 1.0))
 

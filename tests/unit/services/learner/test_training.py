@@ -14,7 +14,7 @@ from common.task.experience import TeacherConfig
 from services.learner.checkpoint import CheckpointError, Extras, checkpoints, restore, save
 from services.learner.config import CurriculumConfig, PPOConfig
 from services.learner.curriculum import StageLengths
-from services.learner.epoch_stats import play_stats
+from services.learner.epoch_stats import merged, play_counts
 from services.learner.ppo import UpdateMode
 from services.learner.run_log import RunLog, row
 from services.learner.training import Training
@@ -274,7 +274,7 @@ def reword(path, old, new):
 
 
 def test_unvalidated_balls_are_in_no_rate():
-    stats = play_stats([make_rollout(0), make_rollout(1)])
+    stats = merged(play_counts([make_rollout(0), make_rollout(1)])[None])
 
     assert (stats.rallies, stats.unvalidated) == (8, 2)
     assert (stats.caught, stats.over, stats.returned) == (4, 2, 2)
