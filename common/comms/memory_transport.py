@@ -12,14 +12,13 @@ from threading import RLock
 from typing import TypeVar
 
 from common.comms.keys import matches
+from common.comms.mailbox import Bell, Mailbox
 from common.comms.transport import (
     MAX_ALIVE_EVENTS,
     MAX_MESSAGE_BYTES,
     AliveEvent,
     AliveWatch,
-    Bell,
     Flow,
-    Mailbox,
     NoReply,
     PendingReply,
     Reply,

@@ -34,14 +34,13 @@ from zenoh.handlers import Callback
 
 from common.comms.budgets import LONGEST_ID, one_line
 from common.comms.certificates import checked, names_in, refusal, speaks_tls, valid_until
+from common.comms.mailbox import Bell, Mailbox
 from common.comms.roles import access_control
 from common.comms.transport import (
     MAX_ALIVE_EVENTS,
     AliveEvent,
     AliveWatch,
-    Bell,
     Flow,
-    Mailbox,
     NoReply,
     PendingReply,
     Reply,

@@ -253,7 +253,7 @@ def test_requests_that_were_left_waiting_end_the_next_wait(net):
 
 
 def test_a_mailbox_needs_room_for_one(net):
-    with pytest.raises(TransportError, match="capacity 0 of a mailbox; allowed: 1 or more"):
+    with pytest.raises(ValueError, match="capacity 0 of a mailbox; allowed: 1 or more"):
         net.hub().subscribe(f"{RUN}/stage", capacity=0)
 
 

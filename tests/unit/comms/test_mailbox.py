@@ -2,7 +2,8 @@
 
 import pytest
 
-from common.comms.transport import MAILBOX_BYTES, Bell, Mailbox, Request, Server
+from common.comms.mailbox import MAILBOX_BYTES, Bell, Mailbox
+from common.comms.transport import Request, Server
 
 
 @pytest.mark.parametrize("keep", ["newest", "oldest"])
