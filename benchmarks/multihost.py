@@ -35,8 +35,7 @@ from benchmarks.chaos.check import NOT_ACCOUNTED, RULES, check, kept_epochs, lea
 from benchmarks.chaos.tail import Tail
 from benchmarks.hosts import Host, local_network
 from benchmarks.settings import BenchmarkConfig, print_figures, run
-from common.errors import ReportedError
-from common.evaluation.evaluate import StoppedError
+from common.errors import ReportedError, StoppedError
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from deploy.topology import role

@@ -21,7 +21,7 @@ from common.errors import ConfigError, ReportedError
 from common.service.config import save_settings, to_tables
 from common.service.config_sources import read_toml
 from common.service.endpoint import PORTS_TRIED
-from common.service.run_folder import LOCKS, RUNS, RunFolder
+from common.service.run_folder import LOCKS, RUNS, RunFolder, newest_run
 from common.service.table import whole_rows
 from deploy.config import CONNECT_S, SECTION, DeployConfig
 from deploy.supervisor import Spec
@@ -32,6 +32,10 @@ from services.learner.budget import ENDING_S, Budget
 
 class RunFailedError(ReportedError):
     """A process that the run needs has failed: one line with the last line of its log."""
+
+
+class UnusableSettingsError(RunFailedError, ConfigError):
+    """It has failed because of its settings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +159,8 @@ def free_endpoint(kind: str = "tcp") -> str:
 def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
     """Yield a run that can start; no other process can run it meanwhile.
 
-    A resumed run whose new settings don't fit, and which fails before it has trained anything, keeps its old ones.
+    A resumed run whose new settings don't fit, and which fails before it has trained anything, keeps its old ones. A
+    new run that fails so is not the newest, and its name is free again.
     """
     if config.run:
         check_name(config)  # first: a live run would fail the other checks too, but this error says more
@@ -168,12 +173,15 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
         before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
+        newest = newest_run()
         write(config, name, folder, link.endpoint)
         try:
             yield PreparedRun(name, config, folder, link)
         except RunFailedError:
             if before and last_epoch(folder) == trained:
                 save_settings(folder.config, before)
+            if newest and not has_trained(folder):
+                RunFolder.of(newest).point_latest_here()
             raise
 
 
@@ -183,10 +191,15 @@ def check_name(config: DeployConfig) -> None:
     folder = RunFolder.of(config.run)
     for holder in LOCKS:
         folder.check_free_of(holder)
-    if folder.config.exists() and not config.resume:
+    if not config.resume and has_trained(folder):
         raise ConfigError(
             f"run {config.run!r} exists already in {folder.root}: go on with --resume, or choose another --run"
         )
+
+
+def has_trained(folder: RunFolder) -> bool:
+    """Return whether a run has left something: one that failed before its first batch leaves its logs alone."""
+    return bool(last_epoch(folder)) or any(folder.checkpoints.glob("*.safetensors"))
 
 
 def new_name(stem: str) -> str:

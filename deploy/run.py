@@ -15,12 +15,12 @@ from common.comms.messages import Status
 from common.comms.roles import name_of
 from common.comms.transport import Transport, TransportError
 from common.service.log import set_up_logging
-from common.service.process import DONE, INTERRUPTED
+from common.service.process import BAD_CONFIG, DONE, INTERRUPTED
 from common.service.table import whole_rows
 from common.service.whole_file import write_whole
 from deploy.history import points_of
 from deploy.panel import View, render
-from deploy.prepare import PreparedRun, RunFailedError, open_link
+from deploy.prepare import PreparedRun, RunFailedError, UnusableSettingsError, open_link
 from deploy.scaling import changes, wanted
 from deploy.supervisor import Supervisor
 from deploy.targets import TargetsFile
@@ -85,7 +85,7 @@ def watch(
             end_hung(watchdog, supervisor, view, now)
             view.restarts = {name: child.restarts for name, child in supervisor.children.items()}
             if name := supervisor.has_bad_config():
-                raise RunFailedError(f"{name} can't use its settings: {supervisor.last_line(name)}")
+                raise UnusableSettingsError(f"{name} can't use its settings: {supervisor.last_line(name)}")
             if live is not None:
                 live.update(render(view, now), refresh=True)
             else:
@@ -184,7 +184,8 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
         return INTERRUPTED
     if status != DONE:
         advice = f"; go on with: {again}" if run.newest_checkpoint() else ""
-        raise RunFailedError(
+        kind = UnusableSettingsError if status == BAD_CONFIG else RunFailedError
+        raise kind(
             f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}"
         )
     # Torch is imported now: at the start of a run it would take the cores from the first batch

@@ -31,7 +31,8 @@ def ask(folder: RunFolder, actors: int) -> None:
         write_whole(folder.wanted_actors, f"{actors}\n")
         return
     raise ReportedError(
-        f"no topspin train keeps the run {folder.root}: allowed: the name of a run that is running"
+        f"no topspin train keeps the run {folder.root}; allowed: the name of a run that one keeps. To a run that was "
+        "started by hand add a services.actor, or end one"
     )
 
 

@@ -7,8 +7,9 @@ from threading import Event
 from typing import Any
 
 from common.comms.messages import FATES, Status
+from common.errors import StoppedError
 from common.evaluation.config import MatchConfig
-from common.evaluation.evaluate import StoppedError, check, measure
+from common.evaluation.evaluate import check, measure
 from common.policy.folder import load_policy
 from common.service.run_folder import RunFolder
 from deploy.history import STAGES

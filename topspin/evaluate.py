@@ -40,11 +40,14 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and print; return the exit status."""
     config = load(EvaluateConfig, argv, prog=PROG, section="evaluate")
     set_up_logging(config.log_level, "evaluate")
-    from common.evaluation.evaluate import check, measure, print_measures
+    from common.evaluation.evaluate import check, measure
+    from common.evaluation.printed import print_measures
     from common.policy.box import policy_folder
     from common.policy.folder import load_policy
+    from topspin.rallies_left import rallies_left
 
     folder = policy_folder(config.policy)
-    found = measure(load_policy(folder), folder, config, lambda: check(stop))
+    with rallies_left(config.rallies) as on_left:
+        found = measure(load_policy(folder), folder, config, lambda: check(stop), on_left)
     print_measures(found, config.json_line)
     return DONE

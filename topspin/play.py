@@ -47,11 +47,13 @@ def main(argv: Sequence[str], stop: Event) -> int:
     """Measure and film; return the exit status."""
     config = load(PlayConfig, argv, prog=PROG, section="play")
     set_up_logging(config.log_level, "play")
-    from common.evaluation.evaluate import check, measure, print_measures
+    from common.evaluation.evaluate import check, measure
     from common.evaluation.match import evaluation_rallies, match_task
+    from common.evaluation.printed import print_measures
     from common.evaluation.rally_recorder import record_rallies
     from common.policy.box import policy_folder
     from common.policy.folder import load_policy
+    from topspin.rallies_left import rallies_left
     from topspin.render.film import check_tools, film
     from topspin.render.score_card import score_card
 
@@ -64,7 +66,8 @@ def main(argv: Sequence[str], stop: Event) -> int:
     def on_tick() -> None:
         check(stop)
 
-    found = measure(policy, folder, config, on_tick)
+    with rallies_left(config.rallies) as on_left:
+        found = measure(policy, folder, config, on_tick, on_left)
     if config.film_rallies:
         found["video"] = config.video
         if not config.json_line:

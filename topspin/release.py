@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from common.errors import ConfigError
 from common.evaluation.config import DEFAULT_ENVS, Environments, MatchConfig, MatchSpin
 from common.policy.box import BOX, policy_folder
 from common.service.config import load
@@ -38,7 +39,7 @@ class ReleaseConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     often: ClassVar = {
-        "The policy": ("policy", "name", "box"),
+        "The policy": ("policy", "name", "replace", "box"),
         "The exams": ("rallies", "seed", "envs", "expected_spin"),
     }
 
@@ -47,7 +48,8 @@ class ReleaseConfig(BaseModel):
         description="policy folder; several, separated by commas: the mean of their weights, for policies that were "
         "trained on from one",
     )
-    name: str = Field("default", pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
+    replace: bool = Field(False, description="replace the policy of this name")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
     seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
     envs: Environments = DEFAULT_ENVS
@@ -63,6 +65,9 @@ def main(argv: Sequence[str], stop: Event) -> int:
     from common.policy.folder import load_policy, mean_policy, save_policy
     from topspin.report.provenance import commit_of
 
+    target = Path(config.box) / config.name
+    if target.exists() and not config.replace:
+        raise ConfigError(f"{target} exists; allowed: another --name, or --replace")
     policies = [load_policy(policy_folder(given)) for given in config.policy.split(",")]
     policy = mean_policy(policies) if len(policies) > 1 else policies[0]
     contract = policy.contract.expecting(config.expected_spin)
@@ -89,7 +94,6 @@ def main(argv: Sequence[str], stop: Event) -> int:
     if contract != policy.contract:
         made_with["trained_with_expected_spin"] = policy.contract.task.observation.expected_spin
     contract = contract.model_copy(update={"measures": found, "made_with": made_with})
-    target = Path(config.box) / config.name
     save_policy(target, policy.network, policy.moments, contract)
     sys.stdout.write(json.dumps({"policy": str(target), "measures": found}) + "\n")
     return DONE

@@ -20,7 +20,7 @@ from benchmarks.chaos.faults import make
 from benchmarks.chaos.schedule import KINDS, Fault, schedule
 from benchmarks.chaos.site import MAX_LAG, Site
 from benchmarks.settings import BenchmarkConfig, print_figures, run
-from common.evaluation.evaluate import StoppedError
+from common.errors import StoppedError
 from common.service.log import set_up_logging
 from common.service.process import DONE
 

@@ -30,8 +30,8 @@ from benchmarks.peers import task
 from benchmarks.peers.measuring import Trained, catch_rate, fresh_balls, seconds_to_goal, train
 from benchmarks.peers.trainers import OURS, SHARED, Trainer, find_trainers, install
 from benchmarks.settings import BenchmarkConfig, print_figures, run
-from common.errors import ReportedError
-from common.evaluation.evaluate import StoppedError, check
+from common.errors import ReportedError, StoppedError
+from common.evaluation.evaluate import check
 
 FINAL_BALLS: Final = 1000
 CURVE_BALLS: Final = 400  # of the policies on the way

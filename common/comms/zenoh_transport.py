@@ -21,6 +21,7 @@ import json
 import logging
 import os
 import queue
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -109,10 +110,13 @@ def open_zenoh(
         try:
             return _opened(config, security, _OPEN_ATTEMPT_S)
         except zenoh.ZError as error:
-            raise TransportError(
-                f"can't listen at {config.endpoint}: {_reason(error)}; stop the learner that listens there, "
-                "or choose another endpoint"
-            ) from error
+            reason = _reason(error)
+            advice = (
+                "stop the learner that listens there, or choose another endpoint"
+                if "in use" in reason
+                else "allowed: an address of this machine, and a port that may be served"
+            )
+            raise TransportError(f"can't listen at {config.endpoint}: {reason}; {advice}") from error
     started = time.monotonic()
     next_log = started
     while True:
@@ -171,8 +175,9 @@ def _zenoh_config(config: ZenohConfig, security: Security | None, attempt_s: flo
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the first line of Zenoh's message without the source position at its end."""
-    return str(error).splitlines()[0].split(" at /")[0]
+    """Return the innermost cause that the first line of Zenoh's message names, without source positions."""
+    first = str(error).splitlines()[0].split(" at /")[0]
+    return re.sub(r"^.*\[\S+: | \(os error \d+\)$", "", first)
 
 
 @dataclass(slots=True, eq=False)

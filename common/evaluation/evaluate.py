@@ -1,24 +1,18 @@
 """Measuring a policy, for `topspin evaluate` and for other commands that need the measures."""
 
-import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 from typing import Any
 
-from common.errors import ReportedError
-from common.evaluation.breakdown import breakdown, survival, table
+from common.errors import StoppedError
+from common.evaluation.breakdown import breakdown, survival
 from common.evaluation.config import MatchConfig
 from common.evaluation.match import environments, evaluation_rallies, match_task, play_match
 from common.evaluation.measures import measures
 from common.evaluation.robot_measures import robot_part
 from common.policy.folder import Policy
-
-
-class StoppedError(ReportedError):
-    """A stop was requested before the command was done."""
 
 
 def check(stop: Event) -> None:
@@ -28,13 +22,20 @@ def check(stop: Event) -> None:
 
 
 def measure(
-    policy: Policy, folder: Path, config: MatchConfig, on_tick: Callable[[], None] = lambda: None
+    policy: Policy,
+    folder: Path,
+    config: MatchConfig,
+    on_tick: Callable[[], None] = lambda: None,
+    on_left: Callable[[int], None] = lambda _left: None,
 ) -> dict[str, Any]:
-    """Return a policy's measures over fixed rallies, the match's conditions, and rates by kind of ball (``by``)."""
+    """Return a policy's measures over fixed rallies, the match's conditions, and rates by kind of ball (``by``).
+
+    ``on_tick`` and ``on_left`` are those of ``play_match``.
+    """
     started = time.monotonic()
     task = match_task(policy.contract, config, config.expected_spin)
     rallies = evaluation_rallies(config.rallies, task, config.seed)
-    result = play_match(policy, rallies, task, config.envs, on_tick)
+    result = play_match(policy, rallies, task, config.envs, on_tick, on_left=on_left)
     match = {
         "launch": task.launch,
         "randomization": task.randomization,
@@ -51,14 +52,3 @@ def measure(
     }
     found = measures(result) | survival(result) | match
     return found | robot_part(result.robot, task.robot) | {"by": breakdown(result)}
-
-
-def print_measures(found: dict[str, Any], as_json: bool) -> None:
-    """Print measures for a person, or as one JSON line."""
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-        return
-    for name, value in found.items():
-        if name != "by":
-            sys.stdout.write(f"{name:>24}  {value}\n")
-    sys.stdout.write("\n".join(table(found["by"])) + "\n")

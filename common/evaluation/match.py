@@ -82,6 +82,7 @@ def play_match(
     on_tick: Callable[[], None] = lambda: None,
     opponents: npt.NDArray[np.int64] | None = None,
     profile: RandomizationProfile | None = None,
+    on_left: Callable[[int], None] = lambda _left: None,
 ) -> MatchResult:
     """Return the result of ``rallies``, played without exploration noise, in the order in which they ended.
 
@@ -95,6 +96,7 @@ def play_match(
             and then knows nothing of the next one. With ``carry_over`` 0 and one round the result does not depend on
             ``envs``, and its rows have the order of ``rallies``. None: every environment has one opponent.
         profile: Ranges of what differs from rally to rally; None: those that the task names.
+        on_left: Called with the number of rallies that have not ended yet, when some have.
 
     A rally in which the simulation failed is left out, so there may be fewer rows than rallies.
     """
@@ -130,6 +132,7 @@ def play_match(
             ended.append(step.finished)
             # By seed: a rally that the simulation's failure ended is over too, but no rate counts it.
             left -= int(np.isin(step.finished.seeds, rallies.seeds).sum())
+            on_left(left)
 
     def rated(name: str) -> npt.NDArray[Any]:
         return np.concatenate([getattr(f, name)[f.validated] for f in ended])

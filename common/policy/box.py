@@ -4,7 +4,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from common.policy.contract import CONTRACT_FILE, PolicyError
+from common.policy.contract import CONTRACT_FILE, NoPolicyError
 from common.service.run_folder import LATEST, RUNS, RunFolder
 
 BOX: Final = Path(str(files("common"))).resolve() / "policies"
@@ -21,7 +21,7 @@ def policy_folder(given: str) -> Path:
     A name of the box means the box, whatever the working directory holds; ``./default`` is a folder.
 
     Raises:
-        PolicyError: It is neither.
+        NoPolicyError: It is neither.
     """
     if given in names():
         return BOX / given
@@ -29,5 +29,5 @@ def policy_folder(given: str) -> Path:
     if folder.parts[:2] == (RUNS.name, LATEST):  # the link may be missing
         folder = RunFolder.of(LATEST).root.joinpath(*folder.parts[2:])
     if not folder.exists():
-        raise PolicyError(f"no policy {given!r}; allowed: a policy folder, or one of {', '.join(names())}")
+        raise NoPolicyError(f"no policy {given!r}; allowed: a policy folder, or one of {', '.join(names())}")
     return folder

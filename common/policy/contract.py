@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from common.errors import ReportedError
+from common.errors import ConfigError, ReportedError
 from common.policy.config import NetworkConfig
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
@@ -19,6 +19,10 @@ WEIGHTS_FILE, CONTRACT_FILE = "weights.safetensors", "contract.json"  # of a pol
 
 class PolicyError(ReportedError, ValueError):
     """A policy that can't be read or doesn't fit: one line with what was given and what is allowed."""
+
+
+class NoPolicyError(PolicyError, ConfigError):
+    """A policy that a setting names, and that is not there."""
 
 
 class Contract(BaseModel):

@@ -47,9 +47,14 @@ class Policy:
         """Return the deterministic actions (B, 7) for raw observations (B, D); only the policy's part is used.
 
         Raises:
-            ValueError: An observed number is not finite; the text names it.
+            ValueError: There are too few numbers, or one is not finite; the text names it.
         """
         width = self.network.obs_size
+        if obs.ndim != 2 or obs.shape[1] < width:
+            raise ValueError(
+                f"obs has shape {obs.shape}; allowed: (B, {width}), as an environment gives it with "
+                "observation=policy.contract.task.observation"
+            )
         if not np.isfinite(obs[:, :width]).all():
             raise ValueError(self._not_finite(obs[:, :width]))
         with torch.inference_mode():

@@ -10,6 +10,7 @@ while playing:  # at the policy's control rate
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +25,7 @@ from common.task.randomization import PROFILES, RallyParameter
 
 Floats = npt.NDArray[np.float32]
 
-_STATES = (0, 1, 2, 3, int(SERVED))
+STATES: Final = (0, 1, 2, 3, int(SERVED))  # of a sample's ball
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +104,18 @@ class Observer:
         Raises:
             ValueError: A number is not finite, is missing, or is no trajectory state. Nothing has changed then.
         """
+        if ball is None:
+            raise ValueError(
+                "ball is None; allowed: the newest sample. Before the first one there is nothing to observe"
+            )
         check_finite("now", now, 1)
         check_finite("joint_pos", joint_pos, JOINTS)
         check_finite("joint_vel", joint_vel, JOINTS)
         check_finite("ball.pos", ball.pos, 3)
         check_finite("ball.vel", ball.vel, 3)
         check_finite("ball.moment", ball.moment, 1)
-        if ball.state not in _STATES:
-            raise ValueError(f"ball.state is {ball.state}; allowed: {', '.join(map(str, _STATES))}")
+        if ball.state not in STATES:
+            raise ValueError(f"ball.state is {ball.state}; allowed: {', '.join(map(str, STATES))}")
         rally = self._rally
         measurement, history = rally.measurement[0], rally.measurement_history[0]
         history[1:] = history[:-1].copy()

@@ -265,6 +265,12 @@ def _leaves(
             yield path, value
 
 
+def _setting_at(location: Sequence[str], program: Program) -> str:
+    """Return the setting that an error's location is in, or ""."""
+    starts = (".".join(location[:n]) for n in range(len(location), 0, -1))
+    return next((path for path in starts if path in program.settings), "")
+
+
 def flag_of(path: str) -> str:
     """Return a setting's flag without its dashes."""
     return path.replace("_", "-")
@@ -280,13 +286,15 @@ def first_line(error: ValidationError, layers: Sequence[Layer], program: Program
     errors = error.errors(include_url=False)
     first = errors[0]
     location = [str(part) for part in first["loc"][1:]]  # without "settings", the name of the merged field
-    path = next(
-        (p for n in range(len(location), 0, -1) if (p := ".".join(location[:n])) in program.settings), ""
-    )
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    path = _setting_at(location, program)
+    # A setting of several types has an error for each of them
+    others = {_setting_at([str(part) for part in one["loc"][1:]], program) or one["loc"] for one in errors}
+    more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
     if not path:
         where = program.name(".".join(location)) if location else program.section
         return f"{where}: {first['msg'].removeprefix('Value error, ')}{more}"
     origin = next((layer.origins[path] for layer in layers if path in layer.origins), "default")
     allowed = program.settings[path].allowed
+    if first["type"] == "missing":
+        return f"--{flag_of(path)} must be given; allowed: {allowed}{more}"
     return f"{program.name(path)} = {first['input']!r} ({origin}); allowed: {allowed}{more}"

@@ -4,7 +4,7 @@
 0   the work was done, or the service stopped on request
 1   it failed: the line on stderr says why
 2   a setting can't be used
-130 a repeated signal ended the process at once (`SECOND_SIGNAL_AFTER_S`)
+130 a command was stopped before it was done, or a repeated signal ended the process at once (`SECOND_SIGNAL_AFTER_S`)
 ==  ==========================================================================
 """
 
@@ -21,7 +21,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Final
 
-from common.errors import ConfigError, HelpRequest, ReportedError
+from common.errors import ConfigError, HelpRequest, ReportedError, StoppedError
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +33,7 @@ INTERRUPTED: Final = 130
 # An error that a user can fix gets one line. Any other error is a bug and keeps its traceback.
 STATUS_OF_ERROR: Final[dict[type[Exception], int]] = {
     ConfigError: BAD_CONFIG,
+    StoppedError: INTERRUPTED,
     ReportedError: FAILED,
 }
 
@@ -61,6 +62,12 @@ later."""
 
 _EXIT_WITHIN_S: Final = 10.0
 
+GRAPHICS: Final = frozenset(
+    {"", "egl", "osmesa", "glfw", "glx", "cgl", "wgl", "enable", "enabled", "on", "true", "1"}
+    | {"disable", "disabled", "off", "false", "0"}
+)
+"""Values of MUJOCO_GL. MuJoCo can't be imported with another one, not even by a program that draws nothing."""
+
 
 def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
     """Return the exit status of ``main``, which is given the event that SIGINT and SIGTERM set.
@@ -72,6 +79,7 @@ def run_service(prog: str, main: Callable[[threading.Event], int]) -> int:
     own_environment()
     stop = stop_on_signals()
     try:
+        check_graphics()
         status = main(stop)
     except HelpRequest as request:
         sys.stdout.write(str(request))
@@ -101,6 +109,13 @@ def own_environment() -> None:
     os.environ["MPLBACKEND"] = "agg"  # figures go to files; a notebook's own can't be loaded here
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # an encoding without our signs
+
+
+def check_graphics() -> None:
+    """Raise ConfigError if MUJOCO_GL has a value with which MuJoCo can't be imported."""
+    value = os.environ.get("MUJOCO_GL", "")
+    if value.lower().strip() not in GRAPHICS:
+        raise ConfigError(f"MUJOCO_GL = {value!r}; allowed: egl, osmesa, glfw, disable, or unset")
 
 
 def stop_on_signals() -> threading.Event:

@@ -133,9 +133,14 @@ class CurriculumConfig(BaseModel):
         return self
 
     def check_budget(self, frames: int) -> None:
-        """Raise ValueError if stages are shares of a number of frames that is not set."""
+        """Raise ValueError if stages are shares of frames that are not set, or end before the frames do."""
         if self.stage_shares and not frames:
             raise ValueError("stage_shares without frames; allowed: frames above 0, which they are shares of")
+        if self.frames is not None and frames > self.frames:
+            raise ValueError(
+                f"frames {frames:,}; allowed: up to {self.frames:,}, the sum of the stages: lengthen "
+                "curriculum.stage_3 for more"
+            )
 
     @property
     def lengths(self) -> tuple[float, ...]:

@@ -64,7 +64,7 @@ def one_line(folder, module, *arguments):
         (
             LEARNER,
             "--experience.teacher.policy nowhere",
-            1,
+            2,
             "no policy 'nowhere'; allowed: a policy folder, or one",
         ),
         (
@@ -76,13 +76,13 @@ def one_line(folder, module, *arguments):
         (
             DEPLOY,
             "--experience.teacher.policy p --learner.ppo.correction-weight 0",
-            1,
+            2,
             "ppo.correction_weight 0 with experience.teacher.policy",
         ),
         (
             TOPSPIN,
             "evaluate --policy nowhere",
-            1,
+            2,
             "no policy 'nowhere'; allowed: a policy folder, or one of default, mild, paper",
         ),
         (
@@ -148,8 +148,9 @@ def test_unreadable_files_are_named_with_their_faults(tmp_path):
 
 
 def test_a_run_is_not_started_again_by_accident(tmp_path):
-    (tmp_path / "runs" / "r").mkdir(parents=True)
+    (tmp_path / "runs" / "r" / "checkpoints").mkdir(parents=True)
     (tmp_path / "runs" / "r" / "config.toml").write_text("")
+    (tmp_path / "runs" / "r" / "checkpoints" / "00000001.safetensors").write_bytes(b"")
 
     status, line = one_line(tmp_path, DEPLOY, "--run", "r")
     assert status == 2

@@ -78,7 +78,8 @@ def check_flags(program, flags, monkeypatch):
     """Let a program of ours read its flags. A run that is to be resumed is not there, so that flag is left out."""
     flags = [flag for flag in flags if flag != "--resume"]
     if not {"--help", "--help-all", "--version"} & set(flags):
-        flags.append("--print-config")
+        # A command without flags is only named: some of its settings may have to be given
+        flags.append("--help" if program == "topspin" and len(flags) == 1 else "--print-config")
     if program == "topspin":
         printed(dispatch, ["--help"] if flags == ["--print-config"] else flags, Event())
     elif program.startswith("services."):

@@ -81,7 +81,12 @@ class Canvas:
         self.width, self.height = width, height
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._gl = _open_context(width, height)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:  # a context that draws nothing, as GLFW's without a display
+            raise RenderError(
+                f"nothing can be drawn: {error}; {_WHAT_TO_INSTALL}, and unset MUJOCO_GL"
+            ) from None
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self.scene = mujoco.MjvScene(model, maxgeom=MAX_GEOMS)
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from common.errors import ReportedError
+from common.errors import ConfigError
 from common.policy.contract import PolicyError
 from common.policy.folder import Policy, load_policy
 from common.service.run_folder import LATEST, RUNS, RunFolder
@@ -21,7 +21,7 @@ CURVES: Final = ("target_error_mean", "catch_rate", "over_rate", "return_rate")
 """The paper's curves: average target error, catching, returning and return-to-opponent rate."""
 
 
-class RunError(ReportedError):
+class RunError(ConfigError):
     """A run that can't be reported on: one line."""
 
 

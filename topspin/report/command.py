@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from threading import Event
 from types import ModuleType
 from typing import Final
@@ -60,17 +61,29 @@ def main(argv: Sequence[str], stop: Event) -> int:
     )  # each once, even if it is given under two names
     runs = [read(str(folder), config.policy) for folder in folders]
 
+    out = Path(config.out)
+    make_folder(out)
     found = results(runs, config, lambda: check(stop))
     for line in found.missing:
         log.warning("missing or unequal %s", line)
-    out = Path(config.out)
     try:
-        out.mkdir(parents=True, exist_ok=True)
         page.write(found, figures.draw(found, out), out)
     except OSError as error:
         raise ReportedError(f"can't write the report to {out}: {error.strerror}") from error
     sys.stdout.write(f"{out / 'report.md'}\n{out / 'report.html'}\n{out / 'results.json'}\n")
     return DONE
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder of a report, before hours of play. Raises ConfigError if nothing can be written there."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise ConfigError(
+            f"out = {str(out)!r}: {error.strerror}; allowed: a folder that can be written"
+        ) from None
 
 
 def _drawing() -> tuple[ModuleType, ModuleType]:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.physics.chain import JOINTS
-from common.rally.observer import BallSample
+from common.rally.observer import STATES, BallSample
 from topspin.robot.contract import POLICY_FILE, RobotContract, read_contract
 from topspin.robot.faults import MAX_AGE, Fault, Found, Limits, check_clock, check_numbers, check_stamp
 from topspin.robot.made_up_ball import detections
@@ -112,9 +112,13 @@ class Controller:
         x, y, z = position
         self._waiting.append((float(moment), (float(x), float(y), float(z))))
 
-    def measure(self, sample: BallSample) -> None:
-        """Give a sample of the robot's own perception, with velocity and state, instead of camera detections."""
-        self._waiting.append(sample)
+    def measure(self, sample: BallSample | None) -> None:
+        """Give a sample of the robot's own perception, with velocity and state, instead of camera detections.
+
+        None: it has no new sample, and nothing changes.
+        """
+        if sample is not None:
+            self._waiting.append(sample)
 
     def step(self, now: float, joint_pos: Numbers, joint_vel: Numbers) -> Command:
         """Return the joint targets of a control step. Call it at ``contract.control_rate_hz``.
@@ -177,7 +181,12 @@ class Controller:
         """Pass what was detected since the last step to the tracker, without what is wrong."""
         while self._waiting:
             ball = self._waiting.popleft()
-            if self._begun is None:  # the camera sees a ball before the first one that is played
+            if (
+                self._begun is None
+            ):  # the camera sees a ball that nobody plays, or the program has forgotten to begin
+                self._count(
+                    Found(Fault.BALL_BEFORE_BEGIN, "a ball before begin(target); allowed: one after it")
+                )
                 continue
             if isinstance(ball, BallSample):
                 found = check_stamp(ball.moment, self._tracker.newest, now) or self._check_sample(ball)
@@ -193,7 +202,11 @@ class Controller:
                 self._count(found)
 
     def _check_sample(self, ball: BallSample) -> Found | None:
-        return check_numbers(ball.pos, 3, self._ball_pos) or check_numbers(ball.vel, 3, self._ball_vel)
+        found = check_numbers(ball.pos, 3, self._ball_pos) or check_numbers(ball.vel, 3, self._ball_vel)
+        if found is None and ball.state not in STATES:
+            allowed = ", ".join(map(str, STATES))
+            found = Found(Fault.BALL_OUT_OF_RANGE, f"ball state is {ball.state}; allowed: {allowed}")
+        return found
 
     def _restart(self, found: Found) -> Command:
         """Forget a ball, and what is known of the opponent: numbers that are not finite may be in both."""

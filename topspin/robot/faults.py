@@ -15,8 +15,9 @@ AHEAD: Final = 0.02  # [s] by which a stamp may be ahead of the controller's clo
 class Fault(StrEnum):
     """A kind of bad measurement, and how ``Controller.faults`` counts it."""
 
+    BALL_BEFORE_BEGIN = "ball_before_begin"  # no ball is played yet: ``Controller.begin`` was not called
     BALL_NOT_FINITE = "ball_not_finite"
-    BALL_OUT_OF_RANGE = "ball_out_of_range"  # of the contract: another frame or unit
+    BALL_OUT_OF_RANGE = "ball_out_of_range"  # of the contract: another frame or unit; or no trajectory state
     BALL_OUT_OF_ORDER = "ball_out_of_order"  # not newer than the one before
     BALL_CLOCK = "ball_clock"  # its stamp is ahead of the controller's clock, or too old
     JOINTS_NOT_FINITE = "joints_not_finite"

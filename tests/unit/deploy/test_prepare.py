@@ -234,6 +234,25 @@ def test_a_run_that_fails_before_it_trained_anything_keeps_its_settings(tmp_path
     assert RunFolder.of("r").config.read_text() != before
 
 
+def test_a_new_run_that_trained_nothing_leaves_its_name_and_the_newest_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with prepared(read("--run", "good")):
+        pass
+
+    with suppress(RunFailedError), prepared(read("--run", "r", "--network.units", "8")):
+        raise RunFailedError("no writer 'nope'")
+    assert newest_run() == "good"
+
+    with suppress(RunFailedError), prepared(read("--run", "r", "--network.units", "16")) as run:
+        assert run.config.network.units == (16,)
+        run.folder.metrics.write_text("epoch,frames,seconds\n1,8192,0.5\n")
+        raise RunFailedError("it was killed")
+    assert newest_run() == "r"
+
+    with pytest.raises(ConfigError, match="run 'r' exists already"):
+        prepared(read("--run", "r")).__enter__()
+
+
 def test_for_a_live_run_deploy_is_named_before_its_learner(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for flags in (("--resume",), ()):

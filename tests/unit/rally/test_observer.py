@@ -124,6 +124,19 @@ def test_a_policy_refuses_an_observation_that_is_not_finite_by_name(column, name
         policy.act(obs)
 
 
+def test_without_a_ball_there_is_nothing_to_observe():
+    with pytest.raises(ValueError, match="ball is None; allowed: the newest sample"):
+        Observer(ObservationConfig(critic="policy"), CHAIN).observe(0.0, [0.0] * 7, [0.0] * 7, None)
+
+
+@pytest.mark.parametrize("shape", [(1, 37), (54,)])
+def test_a_policy_names_the_shape_that_it_needs(shape):
+    with pytest.raises(
+        ValueError, match=r"obs has shape .*; allowed: \(B, 54\), as an environment gives it with"
+    ):
+        load_policy(POLICIES / "default").act(np.zeros(shape, np.float32))
+
+
 def test_a_policy_that_observes_the_true_spin_is_refused():
     with pytest.raises(ValueError, match=r"spin 'true' can't be measured"):
         Observer(ObservationConfig(spin="true"), CHAIN)

@@ -10,7 +10,8 @@ import warnings
 import pytest
 
 from common.comms.transport import TransportError
-from common.errors import ConfigError, HelpRequest, ReportedError
+from common.errors import ConfigError, HelpRequest, ReportedError, StoppedError
+from common.policy.contract import NoPolicyError
 from common.service.log import set_up_logging
 from common.service.process import run_service
 
@@ -42,6 +43,8 @@ def raising(error: BaseException):
     [
         (ConfigError("unknown flag --x"), 2, "learner: unknown flag --x\n"),
         (TransportError("no hub answered"), 1, "learner: no hub answered\n"),
+        (StoppedError("stopped before it was done"), 130, "learner: stopped before it was done\n"),
+        (NoPolicyError("no policy 'x'"), 2, "learner: no policy 'x'\n"),
     ],
 )
 def test_a_known_error_is_one_line_and_a_status(capsys, error, status, line):
@@ -191,3 +194,19 @@ def test_a_second_set_up_of_logging_replaces_the_first(capsys):
     logging.getLogger("x").info("unseen")
 
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("value", ["", "EGL", "osmesa ", "disable", "glfw"])
+def test_a_graphics_library_that_mujoco_knows_is_left_alone(monkeypatch, value):
+    monkeypatch.setenv("MUJOCO_GL", value)
+
+    assert run_service("topspin evaluate", lambda _stop: 0) == 0
+
+
+def test_a_graphics_library_that_mujoco_cant_be_imported_with_is_one_line(monkeypatch, capsys):
+    monkeypatch.setenv("MUJOCO_GL", "bogus")
+
+    assert run_service("topspin evaluate", lambda _stop: pytest.fail("it runs")) == 2
+    assert capsys.readouterr().err == (
+        "topspin evaluate: MUJOCO_GL = 'bogus'; allowed: egl, osmesa, glfw, disable, or unset\n"
+    )

@@ -3,12 +3,11 @@ from threading import Event
 
 import pytest
 
-from common.errors import ConfigError
-from common.evaluation.evaluate import StoppedError
+from common.errors import ConfigError, StoppedError
 from common.policy.folder import save_policy
 from common.service.config import load
 from tests.unit.evaluation.test_match import make_policy
-from topspin import evaluate, play
+from topspin import evaluate, play, rallies_left
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
 from topspin.render import film as film_module
@@ -66,7 +65,7 @@ def test_the_numbers_come_before_the_film(folder, tmp_path, capsys, monkeypatch)
     play.main(["--policy", str(folder), "--rallies", "6", "--film-rallies", "1"], Event())
 
     numbers, card = printed
-    assert "return_rate" in numbers
+    assert "returned  " in numbers
     assert card.title == "policy: 6 paper balls"
     assert sum(count for _, count, _ in card.bars) == 6
     assert "film of 1 rallies" in capsys.readouterr().out
@@ -84,6 +83,7 @@ def test_play_stops_on_request(folder):
     ("flags", "line"),
     [
         (["--video", "play.avi"], r"play.video = 'play.avi' \(--video\); allowed: text, matching"),
+        (["--expected-spin", "wild"], r"play.expected_spin = 'wild' \(--expected-spin\); allowed: [^()]*$"),
         (["--slow", "0"], r"play.slow = '0' \(--slow\); allowed: a number, from 0.05 to 1"),
         (["--camera", "top"], "allowed: side, behind, target, follow"),
         (["--film-ralies", "3"], "unknown flag --film-ralies; did you mean '--film-rallies'"),
@@ -111,4 +111,20 @@ def test_evaluate_measures_under_the_conditions_that_are_given(folder, capsys):
 def test_evaluate_prints_a_table(folder, capsys):
     evaluate.main(["--policy", str(folder), "--rallies", "4"], Event())
 
-    assert "return_rate" in capsys.readouterr().out
+    lines = dict(line.split("  ", 1) for line in capsys.readouterr().out.splitlines()[:8])
+    assert lines["policy"].strip().startswith(f"{folder}, ")
+    assert lines["balls"].strip().startswith("4 paper, randomization standard, air full")
+    assert " %  (" in lines["returned"]
+
+
+def test_a_match_says_how_far_it_is_where_there_is_no_terminal(monkeypatch, caplog):
+    monkeypatch.setattr(rallies_left, "LINE_EVERY_S", 0.0)
+
+    with caplog.at_level("INFO"), rallies_left.rallies_left(2000) as on_left:
+        on_left(1500)
+        on_left(0)
+
+    assert [record.getMessage() for record in caplog.records] == [
+        "played rallies=500 of=2000",
+        "played rallies=2000 of=2000",
+    ]

@@ -6,6 +6,7 @@ from threading import Event
 import numpy as np
 import pytest
 
+from common.errors import ConfigError
 from common.policy.contract import PolicyError
 from common.policy.folder import load_policy, save_policy
 from tests.unit.evaluation.test_match import make_policy
@@ -89,6 +90,26 @@ def test_of_several_policies_the_mean_is_released(box, one_exam):
 
 def test_a_folder_without_a_policy_is_not_released(box):
     with pytest.raises(PolicyError, match="no policy 'nowhere'"):
-        release.main(["--policy", "nowhere", "--rallies", "5", "--box", "box"], Event())
+        release.main(["--policy", "nowhere", "--name", "mine", "--rallies", "5", "--box", "box"], Event())
 
     assert not (box / "box").exists()
+
+
+def test_a_name_must_be_given(box):
+    with pytest.raises(ConfigError, match="--name must be given; allowed: text, matching"):
+        release.main(["--policy", "trained", "--box", "box"], Event())
+
+
+def test_a_policy_of_the_box_is_replaced_only_on_request(box, one_exam):
+    put_policy(box / "trained")
+    mine = box / "box" / "mine"
+    put_policy(mine)
+    before = (mine / "contract.json").read_bytes()
+    flags = ["--policy", "trained", "--name", "mine", "--rallies", "4", "--box", "box"]
+
+    with pytest.raises(ConfigError, match=r"box/mine exists; allowed: another --name, or --replace"):
+        release.main(flags, Event())
+    assert (mine / "contract.json").read_bytes() == before
+
+    assert release.main([*flags, "--replace"], Event()) == 0
+    assert load_policy(mine).contract.measures["paper"]["rallies"] == 4

@@ -79,6 +79,17 @@ def test_shares_need_a_number_of_frames():
         SHARES.check_budget(0)
 
 
+def test_frames_that_the_stages_dont_have_are_refused():
+    curriculum = CurriculumConfig(stage_1=100, stage_2=100, stage_3=800)
+
+    curriculum.check_budget(1000)
+    with pytest.raises(
+        ValueError, match=r"frames 1,001; allowed: up to 1,000, the sum of the stages: lengthen"
+    ):
+        curriculum.check_budget(1001)
+    SHARES.check_budget(10**12)
+
+
 def test_a_gate_ends_stage_1_early_once_enough_is_caught():
     lengths = StageLengths(CONFIG.model_copy(update={"catch_gate": 0.9}))
 

@@ -7,8 +7,7 @@ from threading import Event
 import numpy as np
 import pytest
 
-from common.errors import ConfigError, ReportedError
-from common.evaluation.evaluate import StoppedError
+from common.errors import ConfigError, ReportedError, StoppedError
 from common.physics.flight_model import Flight
 from common.policy.folder import save_policy
 from common.service.config import load

@@ -203,6 +203,16 @@ def test_the_showpiece_is_the_return_that_lands_nearest():
     assert showpiece([make_rally(), far, near]) is near
 
 
+def test_a_context_that_draws_nothing_is_one_line(monkeypatch):
+    def fail(*_given):
+        raise mujoco.FatalError("gladLoadGL error")
+
+    monkeypatch.setattr(mujoco, "MjrContext", fail)
+
+    with pytest.raises(RenderError, match=r"^nothing can be drawn: gladLoadGL error; .* unset MUJOCO_GL$"):
+        Painter(64, 64)
+
+
 def test_a_missing_library_is_named_with_the_fix(monkeypatch):
     with pytest.raises(RenderError, match=r"pictures need no_such_library.*pip install -e '\.\[report\]'"):
         wanted("no_such_library")

@@ -26,7 +26,7 @@ from tests.unit.topspin.report.runs import make_run
 from topspin import report
 from topspin.report import command
 from topspin.report.collect import CURVES, Curve, RunError, TrainingCurve, read
-from topspin.report.command import settings
+from topspin.report.command import make_folder, settings
 from topspin.report.config import ReportConfig
 from topspin.report.figures import curves
 from topspin.report.groups import experiment, group
@@ -339,6 +339,15 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     assert "<p>Second &lt;thing&gt;.</p>" in html
     assert set(re.findall(r'(?:src|href)="(.{22})', html)) == {"data:image/png;base64,"}
     assert str(tmp_path) not in page + html + json.dumps(found)
+
+
+def test_a_folder_that_cant_be_written_is_an_error_before_anything_is_played(tmp_path):
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(
+        ConfigError, match=r"out = '.*file/report': Not a directory; allowed: a folder that can be"
+    ):
+        make_folder(tmp_path / "file" / "report")
 
 
 def test_an_unreadable_note_is_an_error_before_anything_is_played(tmp_path, monkeypatch):

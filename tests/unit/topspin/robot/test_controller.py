@@ -122,6 +122,29 @@ def test_the_first_ball_is_played_as_any_other(parts):
     np.testing.assert_allclose(positions(play_ball(used, start=9.0)), positions(first), atol=1e-6)
 
 
+def test_a_ball_before_begin_is_counted_and_nothing_follows_it(controller):
+    controller.see(0.0, (0.5, 0.0, 0.3))
+
+    command = controller.step(0.01, [0.0] * 7, [0.0] * 7)
+
+    assert dict(controller.faults) == {Fault.BALL_BEFORE_BEGIN: 1}
+    assert "allowed: one after it" in controller.last_fault
+    assert not command.is_new
+
+
+def test_a_perception_may_have_no_new_sample_and_knows_five_states(controller):
+    controller.begin((0.9, 0.0))
+    controller.measure(None)
+    assert not controller.step(0.0, [0.0] * 7, [0.0] * 7).is_new
+    assert not controller.faults
+
+    controller.measure(BallSample((0.5, 0.0, 0.3), (-5.0, 0.0, 0.0), 9, 0.02))
+    assert not controller.step(0.02, [0.0] * 7, [0.0] * 7).is_new
+
+    assert dict(controller.faults) == {Fault.BALL_OUT_OF_RANGE: 1}
+    assert controller.last_fault == "ball state is 9; allowed: 0, 1, 2, 3, 4"
+
+
 @pytest.mark.parametrize(
     ("spoil", "fault", "text"),
     [

@@ -1,0 +1,44 @@
+"""How far a match is: a bar in a terminal, else a line of the log now and then."""
+
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+log = logging.getLogger(__name__)
+
+LINE_EVERY_S: Final = 10.0
+
+
+@contextmanager
+def rallies_left(rallies: int) -> Iterator[Callable[[int], None]]:
+    """Yield what ``play_match`` calls as ``on_left``."""
+    is_terminal = sys.stderr.isatty()
+    progress = Progress(
+        TextColumn("playing"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("rallies,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not is_terminal,
+    )
+    next_line = time.monotonic() + LINE_EVERY_S
+
+    def on_left(left: int) -> None:
+        nonlocal next_line
+        progress.update(task, completed=rallies - left)
+        if not is_terminal and time.monotonic() >= next_line:
+            next_line = time.monotonic() + LINE_EVERY_S
+            log.info("played rallies=%d of=%d", rallies - left, rallies)
+
+    with progress:
+        task = progress.add_task("", total=rallies)
+        yield on_left
