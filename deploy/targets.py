@@ -6,7 +6,7 @@ The heartbeats tell the ports, so a service that had to take another port, or ca
 import json
 import logging
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from common.comms.messages import Status
@@ -55,7 +55,7 @@ class TargetsFile:
         self._path, self._run, self._host = path, run, reachable(host)
         self._written: dict[tuple[str, str], int] = {}
 
-    def update(self, statuses: Iterable[Status], names: Iterable[str]) -> None:
+    def update(self, statuses: Iterable[Status], names: Sequence[str]) -> None:
         """Write the file if a port is new. A disk that is full costs a line in the log, not the run."""
         ports = ports_of(statuses, names)
         if ports == self._written:
@@ -67,7 +67,8 @@ class TargetsFile:
             log.error("can't write file=%s reason=%s", self._path, error.strerror)
             return
         at = " ".join(f"{role}-{id_}={port}" for (role, id_), port in ports.items())
-        log.info("metrics host=%s %s; for Prometheus: file=%s", self._host, at, self._path)
+        level = logging.INFO if len(ports) == len(names) else logging.DEBUG  # one line when all have come
+        log.log(level, "metrics host=%s %s; for Prometheus: file=%s", self._host, at, self._path)
 
     def close(self) -> None:
         """Remove the file."""

@@ -40,6 +40,17 @@ def test_a_port_that_changes_is_written_and_the_file_ends_with_the_run(targets, 
     assert not list(tmp_path.iterdir())
 
 
+def test_the_log_says_the_ports_once_all_services_have_come(targets, caplog):
+    with caplog.at_level("INFO"):
+        targets.update(HEARD, NAMES)
+        assert not caplog.text
+        targets.update([*HEARD, a_status("actor", "0", metrics_port=9102.0)], NAMES)
+
+    assert [record.getMessage() for record in caplog.records] == [
+        f"metrics host=127.0.0.1 learner-0=9100 actor-0=9102 actor-1=9103; for Prometheus: file={targets._path}"
+    ]
+
+
 def test_a_folder_that_cant_be_written_costs_a_line_and_not_the_run(tmp_path, caplog):
     TargetsFile(tmp_path / "gone" / "targets.json", "night", "127.0.0.1").update(HEARD, NAMES)
 
