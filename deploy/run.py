@@ -185,9 +185,7 @@ def conclude(run: PreparedRun, supervisor: Supervisor, learner: Status | None, s
     if status != DONE:
         advice = f"; go on with: {again}" if run.newest_checkpoint() else ""
         kind = UnusableSettingsError if status == BAD_CONFIG else RunFailedError
-        raise kind(
-            f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}"
-        )
+        raise kind(f"the learner ended with status {status}: {supervisor.last_line(LEARNER)}{advice}")
     # Torch is imported now: at the start of a run it would take the cores from the first batch
     from deploy.summary import final_measures, next_commands, run_summary, table  # noqa: PLC0415
 
