@@ -122,8 +122,9 @@ def model_card(contract: RobotContract, example: str, wheel: str, parity: float)
         "",
         f"Plays table tennis: it observes {contract.size} numbers and sends {len(contract.joints)} joint targets, "
         f"{contract.control_rate_hz:g} times a second, so that the ball lands on a target. Trained in simulation by "
-        f"Topspin {contract.made_with.get('topspin', '')}, run `{trained['run']}`, {trained['frames']:,} frames, on "
-        f"balls of launch `{trained['launch']}` in the air `{trained['flight']}`.",
+        f"Topspin {contract.made_with.get('topspin', '')}. Its last run, `{trained['run']}`, had {trained['frames']:,} "
+        f"frames on balls of launch `{trained['launch']}` in the air `{trained['flight']}`; it may have begun with "
+        "a trained policy.",
         "",
         "## Files",
         "",
