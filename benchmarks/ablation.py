@@ -95,7 +95,7 @@ def differences(arms: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[st
             )
             apart = over_seeds(a, b)
             if apart is not None:
-                rounded = {name: round(value, 4) for name, value in asdict(apart).items()}
+                rounded = {name: value and round(value, 4) for name, value in asdict(apart).items()}
                 found.append({"first": one, "second": other, "measure": measure, **rounded})
     return found
 
@@ -116,10 +116,11 @@ def main(config: AblationConfig, stop: Event) -> int:
         for one in runs:
             print(f"  seed {one['seed']}  " + "  ".join(f"{key} {one[key]}" for key in MEASURES))
     for one in apart:
-        print(
-            f"{one['second']} minus {one['first']}, {one['measure']}: {one['mean']:+.4f}, 95 % interval "
-            f"{one['low']:+.4f} to {one['high']:+.4f}, p {one['p']:.3f}, {one['pairs']} pairs"
-        )
+        sure = "no interval: equal differences"
+        if one["p"] is not None:
+            sure = f"95 % interval {one['low']:+.4f} to {one['high']:+.4f}, p {one['p']:.3f}"
+        name = f"{one['second']} minus {one['first']}, {one['measure']}"
+        print(f"{name}: {one['mean']:+.4f}, {sure}, {one['pairs']} pairs")
     return FAILED if faults else DONE
 
 

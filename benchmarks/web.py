@@ -21,13 +21,14 @@ from pydantic import Field
 
 from benchmarks.settings import BenchmarkConfig, print_figures, run
 from common.errors import ReportedError
+from common.evaluation.config import SEED
 from common.evaluation.match import evaluation_rallies, match_task
 from common.evaluation.rally_recorder import record_rallies
 from common.policy.box import policy_folder
 from common.policy.folder import Policy, load_policy
 from common.task.config import MatchConditions, PresetName
 from common.task.states import Outcome
-from topspin.web.folder import BALLS, SEED, write_page
+from topspin.web.folder import BALLS, write_page
 
 FOUND: Final = "found.json"  # that Node.js writes
 PLAY: Final = """

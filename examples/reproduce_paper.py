@@ -2,7 +2,8 @@
 
     python examples/reproduce_paper.py --seeds 1 2 --frames 60000000
 
-Runs are in runs/paper-SEED. What is trained already is not trained again, so the program goes on where it was stopped.
+Runs are in runs/RECIPE-FRAMES-SEED. What is trained already is not trained again, so the program goes on where it was
+stopped.
 """
 
 import argparse
@@ -30,7 +31,7 @@ def topspin(*flags: object) -> str:
 
 found = {}
 for seed in arguments.seeds:
-    run = f"paper-{seed}"
+    run = f"{Path(arguments.recipe).stem}-{arguments.frames}-{seed}"
     if Path("runs", run).exists():
         topspin("train", "--run", run, "--resume")
     else:

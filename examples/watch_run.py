@@ -55,7 +55,9 @@ for group in json.loads(file.read_text()):
     status, text = get(address, "/readyz")
     values = {}
     if status == 200:
-        for family in text_string_to_metric_families(get(address, "/metrics")[1]):
+        status, text = get(address, "/metrics")
+    if status == 200:
+        for family in text_string_to_metric_families(text):
             for sample in family.samples:
                 values[sample.name] = values.get(sample.name, 0.0) + sample.value
     else:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import ConfigError
-from common.evaluation.config import DEFAULT_ENVS, Environments, MatchConfig, MatchSpin
+from common.evaluation.config import DEFAULT_ENVS, SEED, Environments, MatchConfig, MatchSpin
 from common.policy.box import BOX, policy_folder
 from common.service.config import load
 from common.service.log import set_up_logging
@@ -51,7 +51,7 @@ class ReleaseConfig(BaseModel):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_-]*$", description="name in the box")
     replace: bool = Field(False, description="replace the policy of this name")
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies of each exam")
-    seed: int = Field(20260, ge=0, lt=2**63, description="of the rallies")
+    seed: int = Field(SEED, ge=0, lt=2**63, description="of the rallies")
     envs: Environments = DEFAULT_ENVS
     expected_spin: MatchSpin = "contract"
     box: str = Field(str(BOX), description="folder of the box")

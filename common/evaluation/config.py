@@ -7,6 +7,7 @@ from pydantic import Field
 from common.task.config import MatchConditions
 from common.task.observation import ExpectedSpin
 
+SEED: Final = 20260  # of the fixed rallies, unless another is set
 DEFAULT_ENVS: Final = 250
 
 Environments = Annotated[
@@ -14,7 +15,8 @@ Environments = Annotated[
     Field(
         ge=1,
         le=65536,
-        description="environments played together; each plays rallies / envs balls of the same opponent",
+        description="environments played together; unless recordings name the players, each plays rallies / envs "
+        "balls of the same opponent",
     ),
 ]
 MatchSpin = Annotated[
@@ -30,6 +32,6 @@ class MatchConfig(MatchConditions):
     """A match: fixed rallies, and the conditions of play."""
 
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to play")
-    seed: int = Field(20260, ge=0, lt=2**63, description="seed of the rallies")
+    seed: int = Field(SEED, ge=0, lt=2**63, description="seed of the rallies")
     envs: Environments = DEFAULT_ENVS
     expected_spin: MatchSpin = "contract"

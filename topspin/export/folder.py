@@ -1,6 +1,7 @@
 """The folder of an exported policy: network, contract, wheel, model card and example."""
 
 import logging
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -26,6 +27,10 @@ TOLERANCE: Final = 1e-5  # largest difference of an action
 
 def check_free(out: Path, flag: str = "--out") -> None:
     """Raise ReportedError unless ``out``, which ``flag`` names, is new or an empty folder."""
+    if out.is_dir() and out.samefile("."):
+        raise ReportedError(
+            f"{out} is the current folder, which can't be replaced; allowed: another one ({flag})"
+        )
     if out.is_dir() and not any(out.iterdir()):
         return
     if out.exists() or out.is_symlink():
@@ -69,7 +74,7 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise ReportedError(f"can't write beside {out}: {error.strerror}") from None
     try:
         yield fresh
-        fresh.chmod(0o755)
+        fresh.chmod(0o777 & ~_umask())  # mkdtemp's is its owner's alone
         if out.is_dir():
             out.rmdir()
         fresh.rename(out)
@@ -77,6 +82,13 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise ReportedError(f"can't write {out}: {error.strerror}") from None
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _umask() -> int:
+    """Return the permissions that new files of this process don't have."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def write_network(

@@ -170,21 +170,21 @@ def _with_unique_names(files: Sequence[Recordings], dropped: Counter[str]) -> tu
     """
     taken: set[str] = set()
 
-    def free(name: str, source: str) -> str:
+    def free(name: str, source: str) -> str | None:
         for tried in (name, f"{Path(source).stem}/{name}"):
             if tried not in taken:
                 taken.add(tried)
                 return tried
         dropped[SAME_NAME] += 1
-        return ""
+        return None
 
     parts, tracks = [], list[Track]()
     for found in files:
         names = [free(name, found.source) for name in found.states.ids]
-        named = replace(found.states, ids=tuple(names))
-        parts.append(_rows(named, np.flatnonzero([bool(name) for name in names])))
+        named = replace(found.states, ids=tuple(name or "" for name in names))
+        parts.append(_rows(named, np.flatnonzero([name is not None for name in names])))
         for track in found.tracks:
-            if name := free(track.id, found.source):
+            if (name := free(track.id, found.source)) is not None:
                 tracks.append(replace(track, id=name))
     states = States(
         tuple(name for part in parts for name in part.ids),

@@ -84,7 +84,8 @@ def write(
 
 
 _LEGEND: Final = (
-    "Spread evenly over all and played again by a robot that starts near its home. The plotted estimate is the "
+    "Spread evenly over all and played again by a robot that starts near its home and knows nothing of the opponent. "
+    "So one of them may end otherwise than it was counted. The plotted estimate is the "
     "policy's observation. It is plotted at the time that it estimates: the camera's mean latency before."
 )
 
@@ -165,8 +166,8 @@ def _about(found: Mapping[str, Any]) -> str:
     return (
         f"{found['data']}: {found['recordings']:,} recordings that fly towards the robot, {found['rallies']:,} of them "
         f"played. Mode {found['mode']}: {how}. Perception {found['perception']}: the ball is observed {observed}. "
-        f"Randomization {found['randomization']}, but the air is the recording's. Policy {found['policy']}, "
-        "without exploration noise."
+        f"Randomization {found['randomization']}, but the air is the recording's, or the nominal one where it shows "
+        f"none. Policy {found['policy']}, without exploration noise."
     )
 
 

@@ -71,7 +71,10 @@ def run(config: Real2SimConfig, stop: Event) -> int:
         again = dict(zip(rows, record_rallies(policy.act, block.of(np.array(rows)), task), strict=True))
     if video is not None:
         found["video"] = str(video)
-        note = f"recorded balls, randomization {config.randomization}, perception {config.perception}"
+        note = (
+            f"recorded balls, randomization {config.randomization}, perception {config.perception}, each played again "
+            "from home"
+        )
         film(video, [again[k] for k in filmed.tolist()], config, note, on_tick)
     found["seconds"] = round(time.monotonic() - started, 2)
     if page is not None:

@@ -1,8 +1,9 @@
 """Recorded balls as rallies: a state, or the launch fitted to a track, simulated again.
 
 A recording gives the launch. The other parameters (target, table, rubber, the camera's noise) are drawn from the
-rally's seed, and the seed from the recording's name. So a recording is the same rally in every process, in any file
-and any order. The result has the form of a generator's block, so every player of rallies can play it.
+rally's seed, and the seed from the recording's name. So a recording is the same rally in every process, whatever else
+is played. A name that an earlier file has too gets its file's name in front, and is then another rally. The result has
+the form of a generator's block, so every player of rallies can play it.
 """
 
 import hashlib

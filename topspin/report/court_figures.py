@@ -167,6 +167,3 @@ def _heat(
     shown = np.ma.masked_where(count < FEWEST, np.nan_to_num(mean))
     _court(ax, robots=bool(edges[0][0] < 0))
     ax.pcolormesh(*edges, shown.T, cmap=colours, norm=shades, edgecolors="white", linewidth=0.4)
-
-
-# ---- rates

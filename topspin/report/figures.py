@@ -54,9 +54,9 @@ def _figures(found: Results, colours: dict[str, str]) -> Iterator[tuple[Drawing,
             Drawing(
                 f"landings{suffix}",
                 "Where balls land",
-                "Above: landings on the opponent's court from above (the net on the left), coloured by their "
-                "distance to the target. Below: landings relative to the target, with circles of 0.2 and 0.3 m "
-                "and the share within; the cross is the mean.",
+                f"{_place(some, 0)}: landings on the opponent's court from above (the net on the left), coloured by "
+                f"their distance to the target. {_place(some, 1)}: landings relative to the target, with circles of "
+                "0.2 and 0.3 m and the share within; the cross is the mean.",
             ),
             landings(some, colours),
         )
@@ -65,8 +65,9 @@ def _figures(found: Results, colours: dict[str, str]) -> Iterator[tuple[Drawing,
             Drawing(
                 f"courts{suffix}",
                 "By place on the table",
-                "Seen from above, the robot on the left. Rows: share returned and landing error by where the ball "
-                f"bounced on the robot's court; share returned by target. Cells of under {FEWEST} rallies are empty.",
+                "Seen from above, the robot on the left. In this order: share returned and landing error by where the "
+                f"ball bounced on the robot's court; share returned by target. Cells of under {FEWEST} rallies are "
+                "empty.",
             ),
             courts(some, colours),
         )
@@ -102,6 +103,11 @@ def _figures(found: Results, colours: dict[str, str]) -> Iterator[tuple[Drawing,
             ),
             rounds([one for one in played if one.survival], colours),
         )
+
+
+def _place(groups: Sequence[GroupResult], kind: int) -> str:
+    """Return where ``panels`` puts the first or the second kind of plot."""
+    return (("Left", "Right") if len(groups) == 1 else ("Above", "Below"))[kind]
 
 
 def _axis_of(curve: Curve, by_time: bool) -> Array:

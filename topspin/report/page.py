@@ -2,6 +2,7 @@
 
 import base64
 import json
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +11,16 @@ from typing import Final
 import jinja2
 
 from common.errors import ReportedError
+from common.service.config_sources import flag_of
 from topspin.report import tables
+from topspin.report.config import ReportConfig
 from topspin.report.results import Results, as_json, mean_of
 from topspin.report.style import Drawing
 from topspin.report.tables import Table, markdown
 
 TITLE: Final = "Topspin: results of the runs"
+ALWAYS: Final = ("rallies", "seed", "launch", "policy")
+"""Settings that the printed command has also where they are the defaults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +48,9 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
             "",
             (
                 f"Every policy plays the same {config.rallies:,} rallies (launch {config.launch}, randomization "
-                f"{config.randomization}, seed {config.seed} of the evaluation's own seeds, collision "
-                f"{config.collision}), without exploration noise and to their end. Runs that differ only in their seed "
-                "are one group.",
+                f"{config.randomization}, air {config.flight}, perception {config.perception}, collision "
+                f"{config.collision}, seed {config.seed} of the evaluation's own seeds), without exploration noise and "
+                "to their end. Runs that differ only in their seed are one group.",
             ),
         ),
         Section("In words", note(config.note)),
@@ -101,16 +106,18 @@ def _commands(found: Results) -> str:
                 lines.append(f"# then trained further: its policy is the mean of {len(parts)}")
                 lines += [f"#     {part}" for part in parts]
         lines.append("")
-    config = found.settings
-    runs = " ".join(result.run.name for one in found.groups for result in one.runs)
-    rounds = " --rounds-too" if config.rounds_too else ""
-    noted = f" --note {config.note}" if config.note else ""
-    lines += [
-        "# this report",
-        f"topspin report {runs} --rallies {config.rallies} --seed {config.seed} "
-        f"--launch {config.launch} --policy {config.policy}{rounds}{noted}",
-    ]
+    lines += ["# this report", own_command(found.settings)]
     return "\n".join(lines)
+
+
+def own_command(config: ReportConfig) -> str:
+    """Return the command of a report: its runs as they were given, what is often set, and what is not the default."""
+    words = ["topspin", "report", *dict.fromkeys(config.runs)]
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if name not in ("runs", "out") and (name in ALWAYS or value != field.default):
+            words += [f"--{flag_of(name)}"] if value is True else [f"--{flag_of(name)}", str(value)]
+    return shlex.join(words)
 
 
 def as_markdown(parts: Sequence[Section], title: str = TITLE) -> str:

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from topspin.report.results import GroupResult
+from topspin.report.results import GroupResult, by_seed
 
 COMPARED: Final = ("return_rate", "return_after_catch", "target_error_mean")
 """Measures whose differences are reported."""
@@ -24,9 +24,9 @@ class Difference:
     """Mean of b - a over pairs."""
 
     mean: float
-    low: float  # 95 % interval
-    high: float
-    p: float  # two-sided
+    low: float | None  # 95 % interval; None: all differences are equal, and say nothing about their spread
+    high: float | None
+    p: float | None  # two-sided
     pairs: int
 
 
@@ -49,10 +49,8 @@ def difference(a: Sequence[float], b: Sequence[float]) -> Difference:
     if len(a) != len(b) or len(a) < 2:
         raise ValueError(f"{len(a)} and {len(b)} values; allowed: two or more pairs")
     apart = np.subtract(b, a)
-    if np.ptp(apart) == 0.0:  # no spread: the test has no denominator
-        return Difference(
-            float(apart[0]), float(apart[0]), float(apart[0]), float(apart[0] == 0.0), len(apart)
-        )
+    if np.ptp(apart) <= np.spacing(np.abs([*a, *b]).max()):  # no spread: the test has no denominator
+        return Difference(float(apart.mean()), None, None, None, len(apart))
     test = stats.ttest_rel(b, a)
     interval = test.confidence_interval(0.95)
     return Difference(
@@ -71,16 +69,7 @@ def comparisons(groups: Sequence[GroupResult]) -> list[Comparison]:
     found = []
     for one, other in combinations(groups, 2):
         for measure in COMPARED:
-            apart = over_seeds(*(by_seed(group, measure) for group in (one, other)))
+            apart = over_seeds(*(by_seed(group.runs, measure) for group in (one, other)))
             if apart is not None:
                 found.append(Comparison(one.label, other.label, measure, apart))
     return found
-
-
-def by_seed(group: GroupResult, measure: str) -> dict[int, float]:
-    """Return one measure of each seed that has it: the mean of the runs of that seed."""
-    values: dict[int, list[float]] = {}
-    for run in group.runs:
-        if run.played is not None and (value := run.measures.get(measure)) is not None:
-            values.setdefault(run.seed, []).append(value)
-    return {seed: float(np.mean(of_seed)) for seed, of_seed in values.items()}

@@ -208,11 +208,20 @@ def _pooled(parts: Sequence[MatchResult | None]) -> MatchResult | None:
 
 def spread(runs: Sequence[RunResult], name: str) -> Spread | None:
     """Return one measure over the seeds that have it, or None if none does."""
-    values = [float(v) for result in runs if (v := result.measures.get(name)) is not None]
+    values = list(by_seed(runs, name).values())
     if not values:
         return None
     deviation = float(np.std(values, ddof=1)) if len(values) > 1 else None
     return Spread(float(np.mean(values)), deviation, min(values), max(values), len(values))
+
+
+def by_seed(runs: Sequence[RunResult], measure: str) -> dict[int, float]:
+    """Return one measure of each seed that has it: the mean of the runs of that seed."""
+    values: dict[int, list[float]] = {}
+    for run in runs:
+        if (value := run.measures.get(measure)) is not None:
+            values.setdefault(run.seed, []).append(float(value))
+    return {seed: float(np.mean(of_seed)) for seed, of_seed in values.items()}
 
 
 def as_json(found: Results) -> dict[str, Any]:

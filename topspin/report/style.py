@@ -101,6 +101,3 @@ def set_title(ax: Axes, label: str, colour: str) -> None:
 def short_number(value: float, _: object = None) -> str:
     """Return a number with at most two decimals, as a formatter of matplotlib's axes."""
     return f"{value:.2f}".rstrip("0").rstrip(".").replace("-", "\N{MINUS SIGN}")
-
-
-# ---- training curves

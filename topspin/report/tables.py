@@ -177,9 +177,12 @@ MEASURED: Final = {
 def _comparison_row(one: Comparison) -> tuple[str, ...]:
     name, scale, unit, digits = MEASURED[one.measure]
     found = one.difference
-    low, mean, high = (f"{scale * value:+.{digits}f}" for value in (found.low, found.mean, found.high))
-    p = "< 0.001" if found.p < 0.001 else f"{found.p:.3f}"
-    return f"{one.second} minus {one.first}", name, f"{mean} {unit}", f"{low} to {high}", p, str(found.pairs)
+    mean = f"{scale * found.mean:+.{digits}f} {unit}"
+    interval = p = NOTHING
+    if found.low is not None and found.high is not None and found.p is not None:
+        interval = f"{scale * found.low:+.{digits}f} to {scale * found.high:+.{digits}f}"
+        p = "< 0.001" if found.p < 0.001 else f"{found.p:.3f}"
+    return f"{one.second} minus {one.first}", name, mean, interval, p, str(found.pairs)
 
 
 def differences(found: Results) -> Table | None:

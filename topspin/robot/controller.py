@@ -15,7 +15,7 @@ import numpy.typing as npt
 from common.physics.chain import JOINTS
 from common.rally.observer import STATES, BallSample
 from topspin.robot.contract import POLICY_FILE, RobotContract, read_contract
-from topspin.robot.faults import MAX_AGE, Fault, Found, Limits, check_clock, check_numbers, check_stamp
+from topspin.robot.faults import AHEAD, MAX_AGE, Fault, Found, Limits, check_clock, check_numbers, check_stamp
 from topspin.robot.made_up_ball import detections
 from topspin.robot.network import Network
 from topspin.robot.tracker import BallTracker, Position
@@ -141,11 +141,18 @@ class Controller:
         if clock is not None:
             self._count(clock)
             return self._hold()
+        self._forget_the_future(now)
         self._take_balls(now)
         sample = self._tracker.sample_at(now)
         if not is_measured or sample is None or now - self._tracker.newest > MAX_AGE or self._joints is None:
             return self._hold()
         return self._act(now, *self._joints, sample)
+
+    def _forget_the_future(self, now: float) -> None:
+        """Begin the ball again if its newest stamp is ahead of a clock that was set back: no other would be newer."""
+        if self._begun is not None and self._tracker.newest > now + AHEAD:
+            target, served = self._begun
+            self._tracker.begin(target, served=served)
 
     def _act(self, now: float, joint_pos: Array, joint_vel: Array, sample: BallSample) -> Command:
         try:

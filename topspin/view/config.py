@@ -4,7 +4,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from common.evaluation.config import MatchSpin
+from common.evaluation.config import SEED, MatchSpin
 from common.service.settings import LogLevel
 from common.task.config import PlayConditions, PresetName, RobotName
 
@@ -45,7 +45,7 @@ class ViewConfig(PlayConditions):
     rate_hz: float = Field(
         50.0, ge=5, le=60, description="pictures per second", json_schema_extra={"unit": "Hz"}
     )
-    seed: int = Field(20260, ge=0, lt=2**63, description="seed of the balls")
+    seed: int = Field(SEED, ge=0, lt=2**63, description="seed of the balls")
     log_level: LogLevel = Field("warning", description="least severe lines logged")
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from common.env.robot import RobotBatch
-from common.evaluation.config import MatchSpin
+from common.evaluation.config import SEED, MatchSpin
 from common.evaluation.match import evaluation_rallies, match_task
 from common.physics.constants import BALL_RADIUS, GRID_STEP
 from common.policy.folder import Policy
@@ -25,7 +25,6 @@ from topspin.web.values import packed, values_of
 
 PAGE: Final = Path(__file__).with_name("page")
 BALLS: Final = 500  # of each kind; then they begin again
-SEED: Final = 20260  # of `topspin evaluate`
 
 _LIBRARIES: Final = """Libraries of this page, as they are in the npm registry:
 

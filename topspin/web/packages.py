@@ -129,7 +129,9 @@ def _archives(npm: str, place: Path) -> list[Path]:
     if done.returncode != 0:
         reason = _reason(done.stdout, done.stderr)
         raise PackageError(f"npm can't fetch {', '.join(wanted)}: {reason}; {_ADVICE}")
-    return [place / str(found["filename"]) for found in json.loads(done.stdout)]
+    # npm 7 and 8 report @scope/name-1.0.tgz for the file scope-name-1.0.tgz
+    names = (str(found["filename"]) for found in json.loads(done.stdout))
+    return [place / name.removeprefix("@").replace("/", "-") for name in names]
 
 
 def _reason(out: str, errors: str) -> str:

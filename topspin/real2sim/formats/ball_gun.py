@@ -56,7 +56,7 @@ def read_hdf5(path: Path) -> Recordings:
                     )
                 mapped = FRAME.positions(positions)
                 tracks += checked_tracks(f"{path.stem}/{name}", times, mapped, label, dropped, given.player)
-    except OSError as error:
+    except (OSError, KeyError, RuntimeError, TypeError) as error:  # h5py's, where bytes are damaged
         raise RecordingError(f"{path}: not readable as HDF5: {error}") from None
     return Recordings(str(path), tuple(tracks), States.none(), dict(dropped))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from topspin.real2sim.formats.frame_check import check_axes, check_origin, check_state_axes, check_units
+from topspin.real2sim.formats.frame_check import MOST, check_axes, check_origin, check_state_axes, check_units
 from topspin.real2sim.formats.frames import Frame, read_frame, sidecar_of
 from topspin.real2sim.formats.text_table import POSITION, SPIN, VELOCITY, Table, read_table
 from topspin.real2sim.formats.tracks import (
@@ -73,10 +73,16 @@ def _tracks(path: Path, table: Table, frame: Frame) -> Recordings:
     rows_of: dict[str, list[int]] = {}
     for row, name in enumerate(ids):
         rows_of.setdefault(name, []).append(row)
+    wrong: list[RecordingError] = []
     for name, rows in rows_of.items():
         t = frame.step * np.arange(len(rows), dtype=np.float64) if times is None else frame.time * times[rows]
-        check_units(path, frame, t, positions[rows])
+        try:
+            check_units(path, frame, t, positions[rows])
+        except RecordingError as error:  # a single one is dropped below, since no ball flies so
+            wrong.append(error)
         tracks += checked_tracks(name, t, positions[rows], labels[rows[0]], dropped, players[rows[0]])
+    if len(wrong) > MOST * len(rows_of):
+        raise wrong[0]
     check_axes(path, frame, tracks)
     check_origin(path, frame, tracks)
     return Recordings(str(path), tuple(tracks), States.none(), dict(dropped))

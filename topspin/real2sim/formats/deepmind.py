@@ -37,7 +37,7 @@ def read_json(path: Path, turn: bool) -> Recordings:
     )
     dropped: Counter[str] = Counter()
     given = read_frame(path)
-    players = [str(entry.get("player", given.player)) for entry in entries]
+    players = [given.player if (own := entry.get("player")) is None else str(own) for entry in entries]
     labels = [given.label or path.stem] * len(ids)
     states: States = checked_states(ids, world, labels, dropped, turn, players, given.velocity_delay)
     return Recordings(str(path), (), states, dict(dropped))

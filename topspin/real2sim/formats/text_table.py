@@ -76,6 +76,13 @@ def read_table(path: Path, frame: Frame) -> Table:
     Raises:
         RecordingError: The file is no such table.
     """
+    try:
+        return _read(path, frame)
+    except csv.Error as error:
+        raise RecordingError(f"{path}: not readable as a table: {error}") from None
+
+
+def _read(path: Path, frame: Frame) -> Table:
     lines = decoded(path).splitlines()
     content = [
         (n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
@@ -239,7 +246,10 @@ def _table(
             for (n, _), cell in zip(rows, cells[name], strict=True)
         ]
         numbers[name] = factor * np.array(values, np.float64)
-    return Table(numbers, {name: cells[name] for name in TEXTS if name in columns}, len(rows))
+    texts: dict[str, list[str]] = {name: cells[name] for name in TEXTS if name in columns}
+    for name in texts.keys() - {"id"}:  # nobody is a player called nan
+        texts[name] = ["" if cell.lower() in (*_MISSING, "nan") else cell for cell in texts[name]]
+    return Table(numbers, texts, len(rows))
 
 
 def _factor(name: str, unit: str, frame: Frame, where: str) -> float:

@@ -169,6 +169,10 @@ def test_the_command_says_what_it_wrote(small, tmp_path, monkeypatch, capsys):
             r"no policy 'nowhere'; allowed: a policy folder, or one of default, mild, paper",
         ),
         (["--out", "full"], "full is not empty; allowed: a new or an empty folder"),
+        (
+            ["--out", "."],
+            r"\. is the current folder, which can't be replaced; allowed: another one \(--out\)",
+        ),
         (["--out", "file"], "file is no folder; allowed: a new or an empty folder"),
         (["--out", "file/in"], "can't write beside file/in"),
     ],

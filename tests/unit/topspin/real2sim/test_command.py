@@ -166,6 +166,18 @@ def test_recordings_of_one_name_are_distinguished_by_their_file(tmp_path):
     assert np.isnan(found.fit_rms).tolist() == [True] * 4 + [False]
 
 
+def test_recordings_without_a_name_are_played_or_counted(tmp_path):
+    data = write_states(tmp_path / "s.json", [COMING, launch_of(), launch_of()])
+    entries = json.loads(data.read_text())
+    for entry in entries:
+        entry["id"] = ""
+    data.write_text(json.dumps(entries))
+    found = read(settings(data=str(data)), Flight.FULL)
+
+    assert found.rallies.ids == ("", "s/")
+    assert found.dropped == {SAME_NAME: 1}
+
+
 def test_a_repeated_name_in_a_file_is_dropped_and_counted(tmp_path):
     data = write_states(tmp_path / "s.json", [COMING, launch_of(), launch_of()])
     entries = json.loads(data.read_text())

@@ -517,3 +517,53 @@ def test_a_file_that_may_not_be_read_is_one_bad_file_of_a_folder(tmp_path, monke
 
     assert len(load_folder(tmp_path, skipped=skipped)) == 1
     assert skipped == {"a.csv": f"{tmp_path / 'a.csv'}: Permission denied"}
+
+
+# ---- what no recording may cost
+
+
+def test_one_recording_in_other_units_does_not_cost_the_table(tmp_path):
+    rows = [f"{k};" + ";".join(map(repr, map(float, row))) for k in range(10) for row in rows_of(TRACK)]
+    slow = [
+        f"slow;{0.7 * n};" + ";".join(map(repr, map(float, row[1:]))) for n, row in enumerate(rows_of(TRACK))
+    ]
+    path = tmp_path / "many.csv"
+    path.write_text("\n".join(["id;t;x;y;z", *rows, *slow]))
+
+    found = load(path)
+
+    assert {track.id for track in found.tracks} == {f"{k}" for k in range(10)}
+    assert sum(found.dropped.values()) >= 1
+
+
+@pytest.mark.parametrize("cell", ["", "nan", "NA", "-", "null"])
+def test_a_player_that_is_missing_is_nobody(tmp_path, cell):
+    path = tmp_path / "events.csv"
+    numbers = ";".join(map(repr, (1.2, -0.1, 0.4, -5.0, -0.5, 1.5, 60.0, -120.0, 0.0)))
+    path.write_text(f"player;x;y;z;vx;vy;vz;wx;wy;wz\n{cell};{numbers}\nAnna;{numbers}\n")
+
+    assert load(path).states.players == ("", "Anna")
+
+
+def test_a_player_of_json_that_is_null_is_the_sidecars(tmp_path):
+    path = write_json(tmp_path / "rallies.json", STATE | {"player": None}, STATE | {"player": "Anna"})
+    path.with_suffix(".toml").write_text('player = "somebody"')
+
+    assert load(path).states.players == ("somebody", "Anna")
+
+
+def test_a_field_of_text_without_an_end_is_one_line(tmp_path):
+    path = tmp_path / "long.csv"
+    path.write_text("t;x;y;z\n" + "1" * 200_000 + ";1;2;3\n")
+
+    with pytest.raises(RecordingError, match=r"long.csv: not readable as a table: field larger than"):
+        load(path)
+
+
+def test_a_damaged_hdf5_is_one_line(tmp_path):
+    path = write_hdf5(tmp_path / "gun.hdf5", **{"7": (TRACK.times, TRACK.positions)})
+    with h5py.File(path, "a") as file:
+        file["originals/8"] = h5py.SoftLink("/nowhere")
+
+    with pytest.raises(RecordingError, match=r"gun.hdf5: not readable as HDF5: "):
+        load(path)

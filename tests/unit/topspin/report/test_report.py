@@ -2,10 +2,12 @@
 
 import json
 import re
+import shlex
 import sys
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,9 +32,10 @@ from topspin.report.command import make_folder, settings
 from topspin.report.config import ReportConfig
 from topspin.report.figures import curves
 from topspin.report.groups import experiment, group
+from topspin.report.page import own_command
 from topspin.report.provenance import command as command_of
 from topspin.report.provenance import run_defaults
-from topspin.report.results import GroupResult, RunResult, evaluation_task, inequalities
+from topspin.report.results import GroupResult, RunResult, evaluation_task, inequalities, spread
 
 OBSERVATION = TaskConfig().observation
 
@@ -329,7 +332,9 @@ def test_two_tiny_runs_make_a_whole_report(tmp_path, monkeypatch, capsys):
     assert "## What it asked of the robot\n" in page
     assert re.search(r"\n\| a \| rails \| \d+\.\d\d % \| \d+\.\d\d % \| \d\.\d\d \(\w+\) \|", page)
     assert "## In words\n\nIt plays well | mostly.\n\nSecond <thing>.\n" in page
-    assert "--rounds-too --note note.txt" in page
+    written = next(line for line in page.splitlines() if line.startswith("topspin report "))
+    assert written.startswith("topspin report a b --")
+    assert settings(written.split()[2:]) == settings(["a", "b", *words[3:-2], "--note", "note.txt"])
     assert "topspin train --run b --seed 1" in page
     drawn = re.findall(r"!\[.*?\]\((.*?)\)", page)
     assert {"curves_frames.png", "landings.png", "courts.png", "rates.png", "rounds.png"} <= set(drawn)
@@ -387,3 +392,34 @@ def test_a_curve_of_one_point_is_drawn_as_a_point(seeds):
 
     drawn = [line for line in axes.lines if len(line.get_xdata()) == 1]
     assert [line.get_marker() for line in drawn] == ["o"] * seeds
+
+
+def test_the_command_of_a_report_has_every_setting_that_is_not_the_default():
+    words = [
+        "runs/a",
+        "--perception",
+        "full",
+        "--collision",
+        "original",
+        "--rounds-too",
+        "--launch",
+        "strong",
+    ]
+    given = settings([*words, "--out", "o", "--note", "a b"])
+
+    again = settings(shlex.split(own_command(given))[2:])
+
+    assert again.model_copy(update={"out": "o"}) == given
+
+
+def test_two_runs_of_one_seed_are_one_value():
+    runs = [a_result(seed, rate) for seed, rate in ((0, 0.2), (0, 0.4), (1, 0.5))]
+
+    found = spread(runs, "return_rate")
+
+    assert (found.seeds, found.lowest, found.highest) == (2, pytest.approx(0.3), 0.5)
+    assert found.mean == pytest.approx(0.4)
+
+
+def a_result(seed, rate):
+    return SimpleNamespace(seed=seed, measures={"return_rate": rate})

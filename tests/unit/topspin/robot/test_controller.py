@@ -172,6 +172,25 @@ def test_a_bad_detection_is_named_and_counts_as_a_lost_one(parts, spoil, fault, 
     np.testing.assert_array_equal(positions(commands), positions(lost_commands))
 
 
+def test_a_clock_that_is_set_back_costs_the_ball_in_flight_and_not_the_next_detections(controller):
+    play_ball(controller, start=20.0)
+
+    home, still = controller.contract.of_joints("home"), np.zeros(7)
+    commands = []
+    for moment, pos in detections(10 * PERIOD):
+        controller.see(1.0 + moment, pos)
+    for step in range(12):
+        commands.append(controller.step(1.0 + step * PERIOD, home, still))
+
+    assert controller.faults[Fault.CLOCK] == 1
+    assert not commands[0].is_new
+    assert all(command.is_new for command in commands[1:])
+    assert controller._tracker.newest < 2.0
+    for step in range(40):
+        last = controller.step(1.3 + step * PERIOD, home, still)
+    assert not last.is_new  # a ball that was not detected for 0.5 s is lost
+
+
 @pytest.mark.parametrize(
     ("value", "fault"),
     [(NAN, Fault.JOINTS_NOT_FINITE), (INF, Fault.JOINTS_NOT_FINITE), (180.0, Fault.JOINTS_OUT_OF_RANGE)],

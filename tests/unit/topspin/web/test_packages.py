@@ -1,7 +1,9 @@
 """The page's libraries: pinned by their content, or one line that says what to do."""
 
+import json
 import os
 import shutil
+import subprocess
 from dataclasses import replace
 from threading import Event
 
@@ -47,3 +49,15 @@ def test_without_a_registry_the_command_says_what_to_do_and_writes_nothing(tmp_p
         command.main(["--web", "page"], Event())
 
     assert os.listdir() == []
+
+
+@pytest.mark.parametrize("told", ["@mujoco/mujoco-3.14.0.tgz", "mujoco-mujoco-3.14.0.tgz"])
+def test_an_old_npm_that_tells_another_name_than_its_files_is_understood(tmp_path, monkeypatch, told):
+    answer = subprocess.CompletedProcess(
+        [], 0, json.dumps([{"filename": told}, {"filename": "three-1.tgz"}]), ""
+    )
+    monkeypatch.setattr(packages.subprocess, "run", lambda *_given, **_more: answer)
+
+    found = packages._archives("npm", tmp_path)
+
+    assert found == [tmp_path / "mujoco-mujoco-3.14.0.tgz", tmp_path / "three-1.tgz"]
