@@ -220,7 +220,9 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
             self._next_obs, obs = step.obs, step.final_obs
         elif self._drawing is not None:
             self._drawing.show(self._batch.started)
-        info = {name: values[0] for name, values in facts(step.finished).items() if values.size}
+        # An episode may go on after a rally: as in the vector environment, the facts are those of its last one
+        over = facts(step.finished) if step.ended.size else {}
+        info = {name: values[0] for name, values in over.items() if values.size}
         return (
             within(obs[0], self._batch.observation_space),
             float(step.reward[0]),

@@ -19,6 +19,7 @@ from tests.unit.env.rallies import make_env
 from topspin.gym import RallyGymEnv
 from topspin.gym_ids import ENV_ID
 from topspin.gym_vector import RallyVectorEnv
+from topspin.policy import load_policy
 from topspin.render.gl import RenderError
 from topspin.render.scene import Painter
 
@@ -321,6 +322,23 @@ def test_every_rally_is_played_to_its_end_by_default(settings, shares):
     experience = env._batch.env.experience
     assert (experience.end_at_hit_share, experience.continue_share) == shares
     assert not experience.leads_home
+
+
+def test_an_episode_of_two_rallies_tells_the_facts_of_its_last_one():
+    policy = load_policy("default")
+    env = make(observation=policy.contract.task.observation, continue_share=1.0)
+    second, told = 0, 0
+    obs, _ = env.reset(seed=3)
+    for _ in range(400):
+        obs, _, terminated, truncated, info = env.step(policy.act(obs[None])[0])
+        second += env.unwrapped._batch.started._rounds[0] == 2
+        assert bool(info) == (terminated or truncated)
+        if info:
+            told += 1
+            obs, _ = env.reset()
+
+    assert second > 20
+    assert told > 1
 
 
 @pytest.mark.parametrize("observation", [ObservationConfig(), {"history": 4}, PAPER_OBSERVATION])
