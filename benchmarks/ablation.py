@@ -95,7 +95,9 @@ def differences(arms: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[st
             )
             apart = over_seeds(a, b)
             if apart is not None:
-                rounded = {name: value and round(value, 4) for name, value in asdict(apart).items()}
+                rounded = {
+                    name: None if value is None else round(value, 4) for name, value in asdict(apart).items()
+                }
                 found.append({"first": one, "second": other, "measure": measure, **rounded})
     return found
 

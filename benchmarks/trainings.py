@@ -105,10 +105,12 @@ def make(wanted: Iterable[Wanted], stop: Event, trains: bool = True) -> list[str
     for one in wanted:
         if stop.is_set():
             break
+        fault = ""
         try:
-            fault = _train(one, stop) if trains else ""
-            if not trains:
-                made(one)
+            if trains:
+                fault = _train(one, stop)
+            else:
+                made(one)  # raises if it is another training
         except ReportedError as error:  # the others are made all the same
             fault = str(error)
         if fault:

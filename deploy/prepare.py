@@ -53,7 +53,7 @@ class PreparedRun:
 
     def newest_checkpoint(self) -> str:
         """Return the name of the newest checkpoint, or ""."""
-        return max((path.name for path in self.folder.checkpoints.glob("*.safetensors")), default="")
+        return newest_checkpoint(self.folder)
 
     def spent(self) -> str:
         """Return the limit that a resumed run had reached before, such as "10 of 10 minutes", or ""."""
@@ -103,6 +103,11 @@ def last_epoch(folder: RunFolder) -> dict[str, str]:
     """Return the last row of a run's metrics.csv; {} before anything is trained."""
     rows = whole_rows(folder.metrics)
     return rows[-1] if rows and {"epoch", "frames", "seconds"} <= rows[-1].keys() else {}
+
+
+def newest_checkpoint(folder: RunFolder) -> str:
+    """Return the name of a run's newest checkpoint, or ""."""
+    return max((path.name for path in folder.checkpoints.glob("*.safetensors")), default="")
 
 
 def metrics_ports(config: DeployConfig) -> list[int]:
@@ -198,8 +203,8 @@ def check_name(config: DeployConfig) -> None:
 
 
 def has_trained(folder: RunFolder) -> bool:
-    """Return whether a run has left something: one that failed before its first batch leaves its logs alone."""
-    return bool(last_epoch(folder)) or any(folder.checkpoints.glob("*.safetensors"))
+    """Return whether a run has trained: one that failed before its first batch has settings and logs, and no more."""
+    return bool(last_epoch(folder) or newest_checkpoint(folder))
 
 
 def new_name(stem: str) -> str:

@@ -44,7 +44,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     from common.evaluation.printed import print_measures
     from common.policy.box import policy_folder
     from common.policy.folder import load_policy
-    from topspin.rallies_left import rallies_left
+    from topspin.progress import rallies_left
 
     folder = policy_folder(config.policy)
     with rallies_left(config.rallies) as on_left:

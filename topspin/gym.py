@@ -221,8 +221,8 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         elif self._drawing is not None:
             self._drawing.show(self._batch.started)
         # An episode may go on after a rally: as in the vector environment, the facts are those of its last one
-        over = facts(step.finished) if step.ended.size else {}
-        info = {name: values[0] for name, values in over.items() if values.size}
+        of_last = facts(step.finished) if step.ended.size else {}
+        info = {name: values[0] for name, values in of_last.items() if values.size}
         return (
             within(obs[0], self._batch.observation_space),
             float(step.reward[0]),

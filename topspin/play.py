@@ -53,7 +53,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     from common.evaluation.rally_recorder import record_rallies
     from common.policy.box import policy_folder
     from common.policy.folder import load_policy
-    from topspin.rallies_left import rallies_left
+    from topspin.progress import rallies_left
     from topspin.render.film import check_tools, film
     from topspin.render.score_card import score_card
 

@@ -211,20 +211,3 @@ def on_grid(points: Array, values: Array, edges: tuple[Array, Array]) -> tuple[A
     total = np.histogram2d(x, y, bins=edges, weights=values[known])[0]
     mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
     return mean, count.astype(np.int64)
-
-
-def table(found: dict[str, list[dict[str, Any]]]) -> list[str]:
-    """Return ``breakdown`` as lines for people."""
-    lines = []
-    for key, bins in found.items():
-        lines += ["", f"{BREAKDOWNS[key].title:>40}  rallies  caught  returned  after catch   error"]
-        for entry in bins:
-            rates = "".join(
-                f"{'-' if entry[name] is None else f'{100 * entry[name]:.1f} %':>{width}}"
-                for name, width in (("catch_rate", 8), ("return_rate", 10), ("return_after_catch", 13))
-            )
-            error = entry["target_error_mean"]
-            lines.append(
-                f"{entry['bin']:>40}  {entry['rallies']:7d}{rates}{'-' if error is None else f'{error:.2f} m':>8}"
-            )
-    return lines

@@ -2,10 +2,10 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from common.evaluation.breakdown import table
+from common.evaluation.breakdown import BREAKDOWNS
 
 RATES: Final = (
     ("caught", "catch_rate"),
@@ -49,6 +49,23 @@ def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     if "robot" in found:
         lines += _robot(found["robot"])
     lines.append(("took", f"{found['seconds']:.1f} s"))
+    return lines
+
+
+def table(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:
+    """Return ``breakdown`` as lines for people."""
+    lines = []
+    for key, bins in found.items():
+        lines += ["", f"{BREAKDOWNS[key].title:>40}  rallies  caught  returned  after catch   error"]
+        for entry in bins:
+            rates = "".join(
+                f"{_share(entry[name]):>{width}}"
+                for name, width in (("catch_rate", 8), ("return_rate", 10), ("return_after_catch", 13))
+            )
+            error = entry["target_error_mean"]
+            lines.append(
+                f"{entry['bin']:>40}  {entry['rallies']:7d}{rates}{'-' if error is None else f'{error:.2f} m':>8}"
+            )
     return lines
 
 

@@ -285,11 +285,13 @@ def first_line(error: ValidationError, layers: Sequence[Layer], program: Program
     """Return one line about the first error."""
     errors = error.errors(include_url=False)
     first = errors[0]
-    location = [str(part) for part in first["loc"][1:]]  # without "settings", the name of the merged field
-    path = _setting_at(location, program)
+    # without "settings", the name of the merged field
+    locations = [tuple(str(part) for part in one["loc"][1:]) for one in errors]
+    paths = [_setting_at(location, program) for location in locations]
+    location, path = locations[0], paths[0]
     # A setting of several types has an error for each of them
-    others = {_setting_at([str(part) for part in one["loc"][1:]], program) or one["loc"] for one in errors}
-    more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+    wrong = {path or location for path, location in zip(paths, locations, strict=True)}
+    more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
     if not path:
         where = program.name(".".join(location)) if location else program.section
         return f"{where}: {first['msg'].removeprefix('Value error, ')}{more}"

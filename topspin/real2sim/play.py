@@ -12,10 +12,11 @@ from typing import Any, Final
 import numpy as np
 
 from common.errors import ReportedError
-from common.evaluation.breakdown import breakdown, table
+from common.evaluation.breakdown import breakdown
 from common.evaluation.evaluate import check
 from common.evaluation.match import match_task, play_match
 from common.evaluation.measures import MatchResult, measures
+from common.evaluation.printed import table
 from common.evaluation.rally_recorder import RecordedRally, record_rallies
 from common.policy.box import policy_folder
 from common.policy.contract import Contract

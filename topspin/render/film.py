@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -10,11 +9,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from common.evaluation.rally_recorder import RecordedRally
 from common.task.states import Outcome
+from topspin.progress import bar
 from topspin.render.config import FilmConfig
 from topspin.render.gl import Image, RenderError, wanted
 from topspin.render.overlay import OUTCOME_WORDS, Caption, Lettering, ScoreCard
@@ -243,17 +241,7 @@ def film(
     )
     count = picture_count(rallies, options, card)
     log.info("filming rallies=%d pictures=%d file=%s", len(rallies), count, path)
-    progress = Progress(
-        TextColumn("filming"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("pictures,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-        console=Console(stderr=True),
-        transient=True,
-        disable=not sys.stderr.isatty(),
-    )
+    progress = bar("filming", "pictures")
 
     def frames() -> Iterator[Image]:
         for picture in progress.track(pictures(rallies, options, card), count):

@@ -2,7 +2,6 @@
 
 import base64
 import json
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,16 +10,13 @@ from typing import Final
 import jinja2
 
 from common.errors import ReportedError
-from common.service.config_sources import flag_of
 from topspin.report import tables
-from topspin.report.config import ReportConfig
+from topspin.report.provenance import own_command
 from topspin.report.results import Results, as_json, mean_of
 from topspin.report.style import Drawing
 from topspin.report.tables import Table, markdown
 
 TITLE: Final = "Topspin: results of the runs"
-ALWAYS: Final = ("rallies", "seed", "launch", "policy")
-"""Settings that the printed command has also where they are the defaults."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,16 +104,6 @@ def _commands(found: Results) -> str:
         lines.append("")
     lines += ["# this report", own_command(found.settings)]
     return "\n".join(lines)
-
-
-def own_command(config: ReportConfig) -> str:
-    """Return the command of a report: its runs as they were given, what is often set, and what is not the default."""
-    words = ["topspin", "report", *dict.fromkeys(config.runs)]
-    for name, field in type(config).model_fields.items():
-        value = getattr(config, name)
-        if name not in ("runs", "out") and (name in ALWAYS or value != field.default):
-            words += [f"--{flag_of(name)}"] if value is True else [f"--{flag_of(name)}", str(value)]
-    return shlex.join(words)
 
 
 def as_markdown(parts: Sequence[Section], title: str = TITLE) -> str:

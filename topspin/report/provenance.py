@@ -1,4 +1,4 @@
-"""Provenance: the commands of the runs, and the versions and machine of the report."""
+"""Provenance: the commands of the runs and of the report, and the versions and machine of the report."""
 
 import os
 import platform
@@ -12,9 +12,12 @@ from typing import Any, Final
 from common.service.config_help import settings_of
 from common.service.config_sources import flag_of
 from deploy.config import DeployConfig
+from topspin.report.config import ReportConfig
 from topspin.report.groups import leaves
 
 PROGRAM: Final = "topspin train"
+ALWAYS: Final = ("rallies", "seed", "launch", "policy")
+"""Settings that the command of a report has also where they are the defaults."""
 PACKAGES: Final = ("topspin", "numpy", "torch", "mujoco", "numba", "eclipse-zenoh")
 NOT_IN_COMMAND: Final = frozenset(
     {"run", "resume", "panel", "endpoint", "metrics_port"}
@@ -43,6 +46,17 @@ def command(name: str, settings: Mapping[str, Any], defaults: Mapping[str, Any])
         if path not in NOT_IN_COMMAND and value != (list(default) if isinstance(default, tuple) else default):
             words += [f"--{flag_of(path)}", _text(value)]
     return " ".join(words[:1] + [shlex.quote(word) for word in words[1:]])
+
+
+def own_command(config: ReportConfig) -> str:
+    """Return the command of a report: its runs as they were given, what is often set, and what is not the default."""
+    words = ["topspin", "report", *dict.fromkeys(config.runs)]
+    for name, field in type(config).model_fields.items():
+        value = getattr(config, name)
+        if name not in ("runs", "out") and (name in ALWAYS or value != field.default):
+            # A switch stands alone: a word behind it would be a run
+            words += [f"--{flag_of(name)}"] if value is True else [f"--{flag_of(name)}", _text(value)]
+    return shlex.join(words)
 
 
 def _text(value: Any) -> str:

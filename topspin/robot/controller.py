@@ -141,18 +141,13 @@ class Controller:
         if clock is not None:
             self._count(clock)
             return self._hold()
-        self._forget_the_future(now)
+        if self._tracker.newest > now + AHEAD:  # the clock was set back: no later stamp would be newer
+            self._begin_again()
         self._take_balls(now)
         sample = self._tracker.sample_at(now)
         if not is_measured or sample is None or now - self._tracker.newest > MAX_AGE or self._joints is None:
             return self._hold()
         return self._act(now, *self._joints, sample)
-
-    def _forget_the_future(self, now: float) -> None:
-        """Begin the ball again if its newest stamp is ahead of a clock that was set back: no other would be newer."""
-        if self._begun is not None and self._tracker.newest > now + AHEAD:
-            target, served = self._begun
-            self._tracker.begin(target, served=served)
 
     def _act(self, now: float, joint_pos: Array, joint_vel: Array, sample: BallSample) -> Command:
         try:
@@ -188,12 +183,10 @@ class Controller:
         """Pass what was detected since the last step to the tracker, without what is wrong."""
         while self._waiting:
             ball = self._waiting.popleft()
-            if (
-                self._begun is None
-            ):  # the camera sees a ball that nobody plays, or the program has forgotten to begin
-                self._count(
-                    Found(Fault.BALL_BEFORE_BEGIN, "a ball before begin(target); allowed: one after it")
-                )
+            if self._begun is None:
+                # The camera sees a ball that nobody plays, or the program has forgotten to begin
+                early = "a ball before begin(target); allowed: one after it"
+                self._count(Found(Fault.BALL_BEFORE_BEGIN, early))
                 continue
             if isinstance(ball, BallSample):
                 found = check_stamp(ball.moment, self._tracker.newest, now) or self._check_sample(ball)
@@ -219,10 +212,14 @@ class Controller:
         """Forget a ball, and what is known of the opponent: numbers that are not finite may be in both."""
         self._count(found)
         self._tracker = BallTracker(self.contract)
+        self._begin_again()
+        return self._hold()
+
+    def _begin_again(self) -> None:
+        """Forget what was measured of the ball that is played."""
         if self._begun is not None:
             target, served = self._begun
             self._tracker.begin(target, served=served)
-        return self._hold()
 
     def _hold(self) -> Command:
         """Return the last targets; before the first, where the robot stands."""

@@ -16,7 +16,6 @@ import yaml
 from common.errors import ConfigError
 from common.service.config import load
 from deploy.manifests import compose, hosts, kubernetes
-from deploy.manifests.__main__ import main
 from deploy.manifests.files import FOLDER, files
 from deploy.manifests.site import ROUTER, SITE
 from deploy.router import RouterConfig
@@ -73,17 +72,6 @@ def test_the_files_in_the_repository_are_what_the_tables_give():
     for folder in ("monitoring", "cluster"):
         found = {str(p.relative_to(FOLDER)) for p in (FOLDER / folder).rglob("*") if p.is_file()}
         assert found - expected.keys() - BY_HAND == set()
-
-
-@pytest.mark.parametrize(("flag", "status"), [("--help", 0), ("--check", 2)])
-def test_only_the_bare_command_writes(monkeypatch, flag, status):
-    monkeypatch.setattr("sys.argv", ["manifests", flag])
-    monkeypatch.setattr("deploy.manifests.__main__.files", lambda: pytest.fail("it writes"))
-
-    with pytest.raises(SystemExit) as ended:
-        main()
-
-    assert ended.value.code == status
 
 
 def test_every_command_of_a_container_is_read_by_its_program(tmp_path):

@@ -12,9 +12,9 @@ from common.evaluation.breakdown import (
     on_grid,
     spin_kinds,
     survival,
-    table,
 )
 from common.evaluation.measures import wilson
+from common.evaluation.printed import table
 from common.task.states import Outcome
 from tests.unit.evaluation.played import MISSED, NAN, OUT, RETURNED, make_played, random_played
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from threading import Event
 
 import pytest
@@ -77,3 +78,16 @@ def test_gymnasium_imports_topspin_for_an_id_with_its_name():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert done.stdout == "topspin/Rally-v0\n"
+
+
+@pytest.mark.parametrize("program", ["deploy.manifests", "topspin.reference"])
+@pytest.mark.parametrize(("flag", "status"), [("--help", 0), ("--check", 2)])
+def test_only_the_bare_command_writes_files_of_the_repository(monkeypatch, program, flag, status):
+    module = import_module(f"{program}.__main__")
+    monkeypatch.setattr("sys.argv", [program, flag])
+    monkeypatch.setattr(module, "files", lambda: pytest.fail("it writes"))
+
+    with pytest.raises(SystemExit) as ended:
+        module.main()
+
+    assert ended.value.code == status

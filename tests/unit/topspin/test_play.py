@@ -7,7 +7,7 @@ from common.errors import ConfigError, StoppedError
 from common.policy.folder import save_policy
 from common.service.config import load
 from tests.unit.evaluation.test_match import make_policy
-from topspin import evaluate, play, rallies_left
+from topspin import evaluate, play, progress
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
 from topspin.render import film as film_module
@@ -118,9 +118,9 @@ def test_evaluate_prints_a_table(folder, capsys):
 
 
 def test_a_match_says_how_far_it_is_where_there_is_no_terminal(monkeypatch, caplog):
-    monkeypatch.setattr(rallies_left, "LINE_EVERY_S", 0.0)
+    monkeypatch.setattr(progress, "LINE_EVERY_S", 0.0)
 
-    with caplog.at_level("INFO"), rallies_left.rallies_left(2000) as on_left:
+    with caplog.at_level("INFO"), progress.rallies_left(2000) as on_left:
         on_left(1500)
         on_left(0)
 

@@ -9,7 +9,6 @@ import pytest
 from common.comms.messages import MESSAGES
 from common.service.config_sources import TABLES
 from common.task.states import Outcome, State
-from topspin.reference.__main__ import main
 from topspin.reference.files import FOLDER, files
 
 PROJECT = Path(__file__).parents[4]
@@ -20,17 +19,6 @@ def test_the_file_is_current(name):
     assert (PROJECT / FOLDER / name).read_text(encoding="utf-8") == files()[name], (
         "run: python -m topspin.reference"
     )
-
-
-@pytest.mark.parametrize(("flag", "status"), [("--help", 0), ("--check", 2)])
-def test_only_the_bare_command_writes(monkeypatch, flag, status):
-    monkeypatch.setattr("sys.argv", ["reference", flag])
-    monkeypatch.setattr("topspin.reference.__main__.files", lambda: pytest.fail("it writes"))
-
-    with pytest.raises(SystemExit) as ended:
-        main()
-
-    assert ended.value.code == status
 
 
 @pytest.mark.parametrize("name", [name for name in sorted(files()) if name.endswith(".svg")])

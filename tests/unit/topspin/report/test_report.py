@@ -32,9 +32,8 @@ from topspin.report.command import make_folder, settings
 from topspin.report.config import ReportConfig
 from topspin.report.figures import curves
 from topspin.report.groups import experiment, group
-from topspin.report.page import own_command
 from topspin.report.provenance import command as command_of
-from topspin.report.provenance import run_defaults
+from topspin.report.provenance import own_command, run_defaults
 from topspin.report.results import GroupResult, RunResult, evaluation_task, inequalities, spread
 
 OBSERVATION = TaskConfig().observation

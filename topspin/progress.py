@@ -1,4 +1,4 @@
-"""How far a match is: a bar in a terminal, else a line of the log now and then."""
+"""How far a long piece of work is: a bar in a terminal, else a line of the log now and then."""
 
 import logging
 import sys
@@ -15,27 +15,31 @@ log = logging.getLogger(__name__)
 LINE_EVERY_S: Final = 10.0
 
 
-@contextmanager
-def rallies_left(rallies: int) -> Iterator[Callable[[int], None]]:
-    """Yield what ``play_match`` calls as ``on_left``."""
-    is_terminal = sys.stderr.isatty()
-    progress = Progress(
-        TextColumn("playing"),
+def bar(doing: str, things: str) -> Progress:
+    """Return a bar with the time that is left, shown in a terminal only."""
+    return Progress(
+        TextColumn(doing),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("rallies,"),
+        TextColumn(f"{things},"),
         TimeRemainingColumn(),
         TextColumn("left"),
         console=Console(stderr=True),
         transient=True,
-        disable=not is_terminal,
+        disable=not sys.stderr.isatty(),
     )
+
+
+@contextmanager
+def rallies_left(rallies: int) -> Iterator[Callable[[int], None]]:
+    """Yield what ``play_match`` calls as ``on_left``."""
+    progress = bar("playing", "rallies")
     next_line = time.monotonic() + LINE_EVERY_S
 
     def on_left(left: int) -> None:
         nonlocal next_line
         progress.update(task, completed=rallies - left)
-        if not is_terminal and time.monotonic() >= next_line:
+        if progress.disable and time.monotonic() >= next_line:
             next_line = time.monotonic() + LINE_EVERY_S
             log.info("played rallies=%d of=%d", rallies - left, rallies)
 
