@@ -5,7 +5,7 @@ an edit of ``vec.py`` every other kernel would still run the old code. So the ca
 content of all kernel sources, and an edit anywhere starts a fresh one. Inside it a kernel is found by its module: a
 copy of the project, such as an installed wheel, can use what another copy has compiled. The folder is beside the
 sources of a working copy, else in the user's own cache. A damaged file of the cache is thrown away and made again, and
-a cache that can't be written costs a compilation at each start: both are one line in the log.
+a cache that can't be written costs a compilation at each start: both are one line in the log, and so is compiling.
 """
 
 import hashlib
@@ -105,13 +105,16 @@ class _KernelCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled kernel for a signature; None where it has to be compiled."""
+        """Return the compiled kernel for a signature; None where it has to be compiled, which is said once."""
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception as error:  # whatever damaged content makes pickle raise
             _say_once("damaged files of the kernel cache are thrown away and made again", error)
             self._throw_away()
             return None
+        if found is None:
+            _say_that_it_compiles()
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled kernel, where that is possible."""
@@ -141,7 +144,16 @@ def _room_of(function: Callable[..., Any]) -> str:
 
 
 _NOT_KEPT: Final = "compiled kernels can't be kept, so every start compiles"
+_COMPILES: Final = "compiling kernels: all of them take one to three minutes, once for each version"
 _said: set[tuple[str, str]] = set()
+
+
+def _say_that_it_compiles() -> None:
+    """Log that this process compiles, before the first kernel: a start that is silent for minutes looks dead."""
+    folder: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
+    if (folder, _COMPILES) not in _said:
+        _said.add((folder, _COMPILES))
+        log.info("%s folder=%s", _COMPILES, folder)
 
 
 def _say_once(what: str, error: Exception) -> None:

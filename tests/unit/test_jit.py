@@ -129,6 +129,24 @@ def test_where_the_disk_is_full_kernels_run_and_one_line_says_that_they_are_not_
     ]
 
 
+def test_a_process_says_once_that_it_compiles(tmp_path, cache, caplog):
+    found = twice(tmp_path)
+    with caplog.at_level(logging.INFO):
+        assert found(1.5) == 3.0
+        assert found(2) == 4.0
+
+    assert [message.split(":")[0] for message in caplog.messages] == ["compiling kernels"]
+
+
+def test_kernels_that_are_in_the_cache_are_used_without_a_word(tmp_path, cache, caplog):
+    twice(tmp_path)(1.5)
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        assert twice(tmp_path)(1.5) == 3.0
+
+    assert caplog.messages == []
+
+
 def test_kernels_that_came_with_a_read_only_install_are_copied_once(tmp_path):
     (tmp_path / "installed" / "module_1").mkdir(parents=True)
     (tmp_path / "installed" / "module_1" / "k.nbi").write_text("kernel")
