@@ -20,8 +20,7 @@ def print_measures(found: Mapping[str, Any], as_json: bool) -> None:
     if as_json:
         sys.stdout.write(json.dumps(found) + "\n")
         return
-    lines = [f"{name:<14}  {text}" for name, text in summary(found)]
-    sys.stdout.write("\n".join([*lines, *table(found["by"])]) + "\n")
+    sys.stdout.write("\n".join([*aligned(summary(found)), *table(found["by"])]) + "\n")
 
 
 def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -36,9 +35,7 @@ def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"seed {found['seed']}",
         ),
     ]
-    lines += [(name, _rate(found[key], found[f"{key}_ci"])) for name, key in RATES]
-    lines.append(("landing error", _error(found)))
-    lines.append(("how they ended", ", ".join(f"{name} {n:,}" for name, n in found["outcomes"].items())))
+    lines += results(found)
     if found["rounds"] > 1:
         rows = ", ".join(
             f"{number}: {_share(one['survival'])}" for number, one in enumerate(found["by_round"], 1)
@@ -50,6 +47,20 @@ def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:
         lines += _robot(found["robot"])
     lines.append(("took", f"{found['seconds']:.1f} s"))
     return lines
+
+
+def results(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the names and texts of ``measures``: rates with their 95 % intervals, landings, outcomes."""
+    return [
+        *((name, _rate(found[key], found[f"{key}_ci"])) for name, key in RATES),
+        ("landing error", _error(found)),
+        ("how they ended", ", ".join(f"{name} {n:,}" for name, n in found["outcomes"].items())),
+    ]
+
+
+def aligned(lines: Sequence[tuple[str, str]]) -> list[str]:
+    """Return names and texts as lines for people, in two columns."""
+    return [f"{name:<14}  {text}" for name, text in lines]
 
 
 def table(found: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[str]:

@@ -1,8 +1,6 @@
 """Recordings of real balls, played with a policy: what is measured, and the files that are written."""
 
-import json
 import logging
-import sys
 import time
 from pathlib import Path
 from threading import Event
@@ -16,7 +14,6 @@ from common.evaluation.breakdown import breakdown
 from common.evaluation.evaluate import check
 from common.evaluation.match import match_task, play_match
 from common.evaluation.measures import MatchResult, measures
-from common.evaluation.printed import table
 from common.evaluation.rally_recorder import RecordedRally, record_rallies
 from common.policy.box import policy_folder
 from common.policy.contract import Contract
@@ -26,6 +23,7 @@ from common.task.config import TaskConfig
 from topspin.real2sim.config import Real2SimConfig
 from topspin.real2sim.dataset import Recorded, evenly, read
 from topspin.real2sim.formats.tracks import RecordingError
+from topspin.real2sim.printed import print_found
 from topspin.render.film import check_tools, film
 
 log = logging.getLogger(__name__)
@@ -136,18 +134,6 @@ def measured(recorded: Recorded, played: MatchResult, config: Real2SimConfig) ->
             "seed": config.seed,
         }
     )
-
-
-def print_found(found: dict[str, Any], as_json: bool) -> None:
-    """Print measures for a person, or as one JSON line."""
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-        return
-    by = {name: found[f"by_{name}"] for name in ("speed", "spin", "spin_kind")}
-    for name, value in found.items():
-        if not name.startswith("by_"):
-            sys.stdout.write(f"{name:>24}  {value}\n")
-    sys.stdout.write("\n".join(table(by)) + "\n")
 
 
 def _page() -> ModuleType:
