@@ -23,7 +23,6 @@ from services.learner.config import LearnerOptions
 
 RECIPES: Final = Path(__file__).with_name("recipes")
 SECTION: Final = "local"
-CONNECT_S: Final = 60.0  # limit for the learner to start listening
 
 
 class DeployConfig(RunSettings, Fleet, BudgetConfig):

@@ -23,7 +23,7 @@ from common.service.config_sources import read_toml
 from common.service.endpoint import PORTS_TRIED
 from common.service.run_folder import LOCKS, RUNS, RunFolder, newest_run
 from common.service.table import whole_rows
-from deploy.config import CONNECT_S, SECTION, DeployConfig
+from deploy.config import SECTION, DeployConfig
 from deploy.supervisor import Spec
 from deploy.topology import ROLES, Role
 from deploy.topology import role as role_named
@@ -177,6 +177,11 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
     folder = RunFolder.of(name)
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
+        for left in (
+            folder.targets,
+            folder.wanted_actors,
+        ):  # of a life that was killed: nobody reads what is asked for
+            left.unlink(missing_ok=True)
         before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
         newest = newest_run()
         write(config, name, folder, link.endpoint)
@@ -264,7 +269,7 @@ def link_to_learner(config: DeployConfig, endpoint: str) -> ZenohConfig:
         return ZenohConfig(
             endpoint=endpoint,
             tls=config.tls,
-            connect_timeout_s=CONNECT_S,
+            connect_timeout_s=config.connect_timeout_s,
         )
     except ValidationError as error:
         raise ConfigError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None

@@ -24,6 +24,8 @@ from deploy.prepare import PreparedRun, RunFailedError, UnusableSettingsError, o
 from deploy.scaling import changes, wanted
 from deploy.supervisor import Supervisor
 from deploy.targets import TargetsFile
+from deploy.topology import ROLES
+from deploy.topology import role as role_named
 from deploy.watchdog import Watchdog
 from deploy.watcher import Watcher
 from services.learner.budget import NOTHING_LEFT
@@ -31,8 +33,6 @@ from services.learner.budget import NOTHING_LEFT
 log = logging.getLogger(__name__)
 
 WATCH_S: Final = 0.25
-LEARNER_PATIENCE_S: Final = 30.0  # time to write a checkpoint
-WORKER_PATIENCE_S: Final = 12.0  # time for an actor to finish its rollout and get the last verdicts
 LEARNER: Final = "learner-0"
 LOG_FILE: Final = "deploy.log"
 
@@ -73,7 +73,6 @@ def watch(
         targets = stack.enter_context(
             closing(TargetsFile(run.folder.targets, run.name, run.config.metrics_host))
         )
-        run.folder.wanted_actors.unlink(missing_ok=True)  # of an earlier life
         # The supervisor has a group of learners as one child
         followers = [name_of("learner", str(rank)) for rank in range(1, run.config.learners)]
         while not stop.is_set() and not supervisor.has_ended(LEARNER):
@@ -138,10 +137,11 @@ def end_hung(watchdog: Watchdog, supervisor: Supervisor, view: View, now: float)
 def end(supervisor: Supervisor, stop: Event) -> None:
     """End all processes. In an interrupted run the actors end first, while the learner still answers."""
     workers = [name for name in supervisor.children if name != LEARNER]
+    patience_s = max(role.grace_s for role in ROLES if role.name != "learner")
     if stop.is_set():
-        supervisor.stop(workers, WORKER_PATIENCE_S)
-    supervisor.stop([LEARNER], LEARNER_PATIENCE_S)
-    supervisor.stop(workers, WORKER_PATIENCE_S)
+        supervisor.stop(workers, patience_s)
+    supervisor.stop([LEARNER], role_named("learner").grace_s)
+    supervisor.stop(workers, patience_s)
 
 
 def run_prepared(run: PreparedRun, stop: Event, prog: str) -> int:

@@ -4,11 +4,11 @@
 run: no message of an open hub can.
 """
 
-import tomllib
 from collections.abc import Iterable
 
 from common.comms.certificates import missing
 from common.errors import ReportedError
+from common.service.config_sources import read_toml
 from common.service.run_folder import RunAliveError, RunFolder
 from common.service.settings import MOST_ACTORS
 from common.service.whole_file import write_whole
@@ -38,7 +38,7 @@ def ask(folder: RunFolder, actors: int) -> None:
 
 def check_certificates(folder: RunFolder, actors: int) -> None:
     """Raise ReportedError if the run has certificates, and none for one of its actors."""
-    settings = tomllib.loads(folder.config.read_text()) if folder.config.is_file() else {}
+    settings = read_toml(folder.config) if folder.config.is_file() else {}
     certificates = str(settings.get("tls", ""))
     if not certificates:
         return

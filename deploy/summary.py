@@ -110,8 +110,9 @@ def more(run: PreparedRun) -> str:
     if spent.endswith("minutes"):
         return f" --minutes {2 * config.minutes:g}"
     curriculum = config.learner.curriculum
-    longer = f" --learner.curriculum.stage-3 {2 * curriculum.stage_3}"
     if spent.endswith("frames"):
-        is_short = curriculum.frames is not None and curriculum.frames < 2 * config.frames
-        return f" --frames {2 * config.frames}{longer if is_short else ''}"
-    return longer if spent else ""
+        twice = 2 * config.frames
+        short = 0 if curriculum.frames is None else max(twice - curriculum.frames, 0)
+        longer = f" --learner.curriculum.stage-3 {curriculum.stage_3 + short}" if short else ""
+        return f" --frames {twice}{longer}"
+    return f" --learner.curriculum.stage-3 {2 * curriculum.stage_3}" if spent else ""

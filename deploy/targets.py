@@ -54,18 +54,21 @@ class TargetsFile:
     def __init__(self, path: Path, run: str, host: str) -> None:
         self._path, self._run, self._host = path, run, reachable(host)
         self._written: dict[tuple[str, str], int] = {}
+        self._has_failed = False  # the last write
 
     def update(self, statuses: Iterable[Status], names: Sequence[str]) -> None:
-        """Write the file if a port is new. A disk that is full costs a line in the log, not the run."""
+        """Write the file if a port is new. A disk that is full costs one line in the log, and is tried again."""
         ports = ports_of(statuses, names)
         if ports == self._written:
             return
-        self._written = ports
         try:
             write_whole(self._path, json.dumps(target_groups(self._run, self._host, ports), indent=1) + "\n")
         except OSError as error:
-            log.error("can't write file=%s reason=%s", self._path, error.strerror)
+            if not self._has_failed:
+                log.error("can't write file=%s reason=%s", self._path, error.strerror)
+            self._has_failed = True
             return
+        self._written, self._has_failed = ports, False
         at = " ".join(f"{role}-{id_}={port}" for (role, id_), port in ports.items())
         level = logging.INFO if len(ports) == len(names) else logging.DEBUG  # one line when all have come
         log.log(level, "metrics host=%s %s; for Prometheus: file=%s", self._host, at, self._path)

@@ -49,6 +49,7 @@ def load(
     section: str,
     environ: Mapping[str, str] | None = None,
     recorded: Path | None = None,
+    beneath: Path | None = None,
     recipes: Path | None = None,
 ) -> _Model:
     """Return the settings of one program.
@@ -59,8 +60,9 @@ def load(
         prog: How the program is called, for the help text.
         section: The program's table in the file, and its part of the environment's names.
         environ: Environment; the process's by default.
-        recorded: File with the settings of a resumed run; ``--config`` takes its place, but the environment's
-            ``TOPSPIN_CONFIG`` does not.
+        recorded: File with the settings of a resumed run. Those of ``--config`` go before; the environment's
+            ``TOPSPIN_CONFIG`` is not read.
+        beneath: File with settings that count where nothing else gives a value.
         recipes: Folder of the recipes that have a name; None: setting ``recipe`` is not followed.
 
     Raises:
@@ -68,7 +70,7 @@ def load(
         HelpRequest: ``--help``, ``--help-all`` or ``--print-config`` is among the flags.
     """
     program = Program(model, settings_of(model), prog, section)
-    layers, prints = read_sources(program, argv, environ, recorded)
+    layers, prints = read_sources(program, argv, environ, recorded, beneath)
     recipe = next((layer.values["recipe"] for layer in layers if "recipe" in layer.values), "")
     if recipes is not None and recipe:
         layers = (*layers, read_file(str(recipe_file(recipe, recipes)), program))

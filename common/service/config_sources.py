@@ -5,6 +5,7 @@ import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -98,17 +99,33 @@ class Program:
 
 
 def read_sources(
-    program: Program, argv: Sequence[str], environ: Mapping[str, str] | None, recorded: Path | None
+    program: Program,
+    argv: Sequence[str],
+    environ: Mapping[str, str] | None,
+    recorded: Path | None,
+    beneath: Path | None = None,
 ) -> tuple[tuple[Layer, ...], bool]:
-    """Return the values from flags, environment and file; and whether ``--print-config`` is among the flags."""
+    """Return the values from flags, environment and files; and whether ``--print-config`` is among the flags."""
     environ = os.environ if environ is None else environ
     prints = PRINT in argv
     flags, file = _read_flags([word for word in argv if word != PRINT], program)
     environment = _read_environment(environ, program)
     if file:
         _check_use(file, program)
-    file = file or str(recorded or environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", ""))
-    return (flags, environment, read_file(file, program) if file else Layer()), prints
+    elif recorded is None:
+        file = environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+    files = [str(one) for one in (file, recorded, beneath) if one]
+    return (flags, environment, *(read_file(one, program) for one in files)), prints
+
+
+def named_file(argv: Sequence[str], environ: Mapping[str, str]) -> Path | None:
+    """Return the settings file that flags or the environment name, or None."""
+    found = environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+    for word, following in pairwise((*argv, "")):
+        name, equals, value = word.partition("=")
+        if name == "--config":
+            found = value if equals else following
+    return Path(found) if found else None
 
 
 def _read_flags(argv: Sequence[str], program: Program) -> tuple[Layer, str]:

@@ -54,11 +54,11 @@ MACHINE_FAULTS: Final = frozenset(
     }
 )
 
-SECOND_SIGNAL_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 15.0}
+SECOND_SIGNAL_AFTER_S: Final = {signal.SIGINT: 0.0, signal.SIGTERM: 25.0}
 """Time after the first signal from which on another one ends the process at once [s]. A second Ctrl-C is a person's
 decision. A second SIGTERM may repeat the first one and must not interrupt the last checkpoint: a service manager
-signals every process of a group, and deploy.local signals its learner again when the workers have ended, at most 12 s
-later."""
+signals every process of a group, and deploy.local signals its learner again when the workers have ended, at most 20 s
+later (``deploy.topology``)."""
 
 _EXIT_WITHIN_S: Final = 10.0
 

@@ -4,12 +4,13 @@ import os
 import time
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from common.comms.zenoh_config import LinkConfig, ZenohConfig
 from common.service.endpoint import FIRST_PORT
+from common.service.run_folder import LATEST, newest_run
 
 MOST_ACTORS: Final = 1000
 LOCAL_ACTORS: Final = 2  # of a run on one machine: they play about what one learner trains
@@ -53,6 +54,12 @@ class ServiceConfig(RunSettings, ZenohConfig):
         description="HTTP port of /metrics, or the next free one; 0: any free one",
     )
 
+    @model_validator(mode="after")
+    def _the_run_is_named(self) -> Self:
+        if self.run == LATEST:  # keys have the run's own name, and the newest run may be another one soon
+            raise ValueError(f"run {LATEST!r}, which is now {newest_run()!r}; allowed: a run's own name")
+        return self
+
 
 class Fleet(BaseModel):
     """How many services a run has."""
@@ -75,7 +82,10 @@ class Fleet(BaseModel):
 
 
 def new_incarnation() -> int:
-    """Return a number that is larger in every later life of a service: milliseconds since 1970, then the process id."""
+    """Return a number that is larger in every later life of a service, unless its host's clock was set back.
+
+    It is milliseconds since 1970, then the process id.
+    """
     return int(time.time() * 1000) * 2**10 + os.getpid() % 2**10
 
 

@@ -5,7 +5,7 @@ import time
 from typing import Final
 
 from common.comms.codec import DecodeError, decode, encode
-from common.comms.messages import ActorReport, Rollout, Verdict, VerdictKind
+from common.comms.messages import FINAL_VERDICTS, ActorReport, Rollout, Verdict, VerdictKind
 from common.comms.transport import Flow, NoReply, PendingReply, Reply, Transport
 from common.service.history import History
 from common.service.member import Member
@@ -23,10 +23,7 @@ REPORT_INTERVAL_S: Final = (
 REPORT_TIMEOUT_S: Final = 5.0
 LAST_VERDICTS_S: Final = 2.0  # wait at the end for rollouts in flight
 LAST_REPORT_S: Final = 2.0
-REFUSALS: Final = frozenset(VerdictKind) - {
-    *(VerdictKind.ACCEPTED, VerdictKind.DUPLICATE, VerdictKind.BUSY),
-    *(VerdictKind.CREDITS, VerdictKind.LIFE_ENDED),
-}
+REFUSALS: Final = FINAL_VERDICTS - {VerdictKind.ACCEPTED}
 
 
 class Delivery:

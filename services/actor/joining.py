@@ -58,7 +58,7 @@ def joined(config: ActorConfig, argv: Sequence[str], prog: str, stop: Event) -> 
         file.write(tomli_w.dumps(settings_of(place)).encode())
         file.flush()
         flags = (*argv, "--id", place.actor, "--index", str(place.index))
-        return load(ActorConfig, flags, prog=prog, section="actor", recorded=Path(file.name))
+        return load(ActorConfig, flags, prog=prog, section="actor", beneath=Path(file.name))
 
 
 def ask(transport: Transport, config: ActorConfig, name: str, stop: Event, metrics: Metrics) -> Place | None:

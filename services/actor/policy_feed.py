@@ -132,7 +132,7 @@ class PolicyFeed:
                 verdict.version,
             )
         is_misfit = verdict.kind in (VerdictKind.WRONG_CONTRACT, VerdictKind.WRONG_RUN)
-        self.misfit = f"a learner of its own contract: {verdict.reason}" if is_misfit else ""
+        self.misfit = f"a learner that takes its rollouts: {verdict.reason}" if is_misfit else ""
 
     def _is_behind(self, outbox: Outbox) -> bool:
         """Return whether the learner is known to have another policy."""

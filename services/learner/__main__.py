@@ -7,11 +7,13 @@ import os
 import socket
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
 from common.comms.keys import Keys
 from common.service.config import first_look, load
+from common.service.config_sources import named_file, read_toml
 from common.service.process import DONE, run_service
 from common.service.run_folder import RunFolder
 from services.learner.config import LearnerConfig
@@ -51,16 +53,23 @@ def main(stop: Event) -> int:
     from services.learner.group import ALONE, join
 
     if "WORLD_SIZE" not in os.environ:
-        return lead(config, ALONE, stop)
+        return lead(config, ALONE, stop, named_file(sys.argv[1:], os.environ))
     group = join()
     try:
-        return lead(config, group, stop)
+        return lead(config, group, stop, named_file(sys.argv[1:], os.environ))
     finally:
         group.leave()
 
 
-def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
-    """Run the learner that keeps the run."""
+def lead(config: LearnerConfig, group: "Group", stop: Event, file: Path | None) -> int:
+    """Run the learner that keeps the run.
+
+    Args:
+        config: Its settings.
+        group: Learners that train together.
+        stop: Ends it.
+        file: The settings file that it was given. Its table [actor] becomes the run's, for actors that join.
+    """
     from common.comms.zenoh_config import endpoint_for_others
     from common.service.connection import connected
     from services.learner import checkpoint
@@ -68,6 +77,7 @@ def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
 
     Keys(config.run)  # refuses a name that can't be part of a key, before a folder is created
     folder = RunFolder.of(config.run, config.folder)
+    actor = read_toml(file).get("actor", {}) if file else {}
     if config.resume:
         checkpoint.newest(folder.checkpoints)  # raises before a folder is created, if there is no checkpoint
     with (
@@ -77,7 +87,7 @@ def lead(config: LearnerConfig, group: "Group", stop: Event) -> int:
         if group.size > 1:
             endpoint = endpoint_for_others(config.endpoint, socket.gethostname())
             group.of_leader(settings_for_others(config, endpoint))
-        LearnerService(config, transport, metrics, group=group).run(stop)
+        LearnerService(config, transport, metrics, group=group, actor=actor).run(stop)
     return DONE
 
 

@@ -31,7 +31,6 @@ from services.learner.training import Training
 log = logging.getLogger(__name__)
 
 FORMAT = 3
-WITHOUT_CHECKSUMS = 2  # a format that is read too
 SUFFIX = ".safetensors"
 KEPT = 3  # newest checkpoints kept in a run
 GOOD = "good"  # subfolder with the last good checkpoint, for a run that diverges
@@ -185,8 +184,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
             found = about["format"]
     except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
         raise DamagedCheckpointError(f"checkpoint {path} is not readable: {error}") from None
-    if found == WITHOUT_CHECKSUMS:
-        return about, tensors
     if found != FORMAT:
         raise CheckpointError(f"checkpoint {path} has format {found!r}; allowed is {FORMAT}")
     if metadata.get("checksum") != str(zlib.crc32(metadata["topspin"].encode())):

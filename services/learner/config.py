@@ -38,7 +38,9 @@ class PPOConfig(BaseModel):
         description="of the learning rate: adaptive: it follows the KL divergence of each pass; constant_then_linear: "
         "learning_rate, and over the last stage linearly to learning_rate_min, as in the paper",
     )
-    learning_rate: float = Field(5e-4, gt=0, le=0.1, description="Adam's at the start")
+    learning_rate: float = Field(
+        5e-4, gt=0, le=0.1, description="Adam's at the start; adaptive: at most learning_rate_max"
+    )
     learning_rate_min: float = Field(
         2e-5, gt=0, le=0.1, description="lower bound of the adaptation; end of the linear decay"
     )
@@ -67,7 +69,8 @@ class PPOConfig(BaseModel):
     refit_frames: int = Field(
         200_000,
         ge=0,
-        description="after a stage change only the critic learns, from so many frames at most",
+        description="after a stage change, and at a start from a policy, only the critic learns, from so many frames "
+        "at most",
         json_schema_extra={"unit": "frames"},
     )
     refit_variance: float = Field(
@@ -130,6 +133,8 @@ class CurriculumConfig(BaseModel):
             )
         if shares and shares[-1] == 0:
             raise ValueError("stage_shares with 0 for stage 3; allowed: above 0, since stage 3 is the last")
+        if self.catch_gate > 0 and not self.lengths[0]:
+            raise ValueError(f"catch_gate {self.catch_gate:g} without stage 1; allowed: 0")
         return self
 
     def check_budget(self, frames: int) -> None:
@@ -185,7 +190,10 @@ class IntakeConfig(BaseModel):
     )
     target_lag: int = Field(1, ge=0, le=64, description="lag that the pacing aims at, where max_lag allows")
     queue_rollouts: int = Field(
-        256, ge=1, description="rollouts that may wait, a dataset at least; bounds the memory"
+        256,
+        ge=1,
+        description="rollouts that may wait, which bounds the memory: a dataset at least, and two where a dataset "
+        "is one rollout of each actor",
     )
     window: int = Field(2, ge=1, le=16, description="credits that one actor may hold")
     credit_patience_s: float = Field(
@@ -223,7 +231,7 @@ class LearnerOptions(BaseModel):
     start_policy: str = Field(
         "",
         description="policy that a new run starts from, by its name in the box or its folder: with its "
-        "network.units and observation, in its stage; empty: new weights",
+        "network.units and observation, in its stage or a later one; empty: new weights",
     )
     device: Device = Field(
         "cpu",
@@ -292,5 +300,7 @@ class LearnerConfig(ServiceConfig, Fleet, BudgetConfig, LearnerOptions):
             raise ValueError(
                 "ppo.correction_weight 0 with experience.teacher.policy; allowed: above 0 (a teacher needs it)"
             )
+        if self.id != "0":
+            raise ValueError(f"id {self.id!r}; allowed: 0, which is the learner that keeps the run")
         self.curriculum.check_budget(self.frames)
         return self

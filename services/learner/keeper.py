@@ -106,7 +106,7 @@ class Keeper:
             if reason == NOT_FINITE:
                 raise DivergedError(
                     f"training has diverged: {reason}, and there is no good checkpoint to go back to; "
-                    "try a lower --ppo.learning-rate-max"
+                    "try a lower ppo.learning_rate_max, or learning_rate where the schedule is the paper's"
                 )
             self._group.of_leader(b"")
             self._training.forget_health()

@@ -5,7 +5,7 @@ So a hundred actors are a hundred equal processes, such as the replicas of one D
 
 import logging
 import re
-from collections.abc import Set
+from collections.abc import Iterable, Set
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -42,10 +42,18 @@ class Places:
     """The numbers of the actors: two that live never have the same one, since it decides their balls and their noise.
 
     A learner that was restarted knows the numbers of names that end with theirs.
+
+    Args:
+        remembered: The names of actors that may live, whose tokens have yet to come: those of a checkpoint. Their
+            numbers are held as if they had just been given.
+        now: [s]
     """
 
-    def __init__(self) -> None:
+    def __init__(self, remembered: Iterable[str] = (), now: float = 0.0) -> None:
         self._given: dict[str, Held] = {}  # by the actor's name, the oldest first
+        for name in remembered:
+            if (number := number_in(name)) is not None:
+                self._given[name] = Held(number, now + HELD_S)
 
     def give(self, name: str, present: Set[str], now: float) -> tuple[str, int]:
         """Return name and number for an actor that joins at ``now`` [s].
@@ -92,10 +100,13 @@ class Registrar:
         file: The run's settings file; its table of actors is theirs too.
         transport: The hub, or a connection to one.
         member: The learner as a member of its run.
+        places: The numbers that are taken.
     """
 
-    def __init__(self, config: LearnerConfig, file: Path, transport: Transport, member: Member) -> None:
-        self._member, self._places = member, Places()
+    def __init__(
+        self, config: LearnerConfig, file: Path, transport: Transport, member: Member, places: Places
+    ) -> None:
+        self._member, self._places = member, places
         self._settings = tomli_w.dumps(settings_for_actors(config, file)).encode()
         self._requests = transport.serve(member.keys.join(), capacity=MAILBOX)
         member.watch("join", self._requests)

@@ -3,11 +3,12 @@
 import logging
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from threading import Event
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
 
 from common.comms.messages import StageChange
 from common.comms.transport import Transport
@@ -32,7 +33,7 @@ from services.learner.keeper import Keeper
 from services.learner.ledger import Ledger
 from services.learner.lockstep import Lockstep
 from services.learner.members import IDLE_WAIT_S
-from services.learner.places import Registrar
+from services.learner.places import Places, Registrar
 from services.learner.reception import Reception, in_order, lives, new_intake, where
 from services.learner.run_log import RunLog, row
 from services.learner.scalars import own_writers
@@ -67,6 +68,7 @@ class LearnerService:
         metrics: Receives the service's numbers.
         clock: Returns seconds.
         group: The learners that train together.
+        actor: Settings of the actors that the learner's own settings file has, for those that join.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class LearnerService:
         metrics: Metrics,
         clock: Callable[[], float] = time.monotonic,
         group: Group = ALONE,
+        actor: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self._config, self._transport, self._metrics, self._clock = config, transport, metrics, clock
         self._group = group
@@ -112,7 +115,8 @@ class LearnerService:
         stages = tuple(StageChange(**change) for change in extras.stage_log) if extras else ()
         self._generation = next_generation(self._folder.generation, extras.generation if extras else 0)
         # After the checkpoint has proved that they fit
-        save_settings(self._folder.config, to_tables(config, "learner"))
+        tables = to_tables(config, "learner") | ({"actor": dict(actor)} if actor else {})
+        save_settings(self._folder.config, tables)
         if not config.resume:
             self._run_log.truncate(0, -1)  # rows of a process that ended before its first checkpoint
         if group.size > 1:  # what the others begin with
@@ -133,9 +137,13 @@ class LearnerService:
         self._broadcast = Broadcast(
             transport, self._member.keys, self.training, identity, stages, config.evaluated_weights
         )
-        self._registrar = Registrar(config, self._folder.config, transport, self._member)
+        known = [str(account["actor"]) for account in extras.accounts] if extras else []
+        self._registrar = Registrar(
+            config, self._folder.config, transport, self._member, Places(known, self._clock())
+        )
         self._has_nothing_left = self._has_ended = False
         self._warned = False
+        self._is_mid_epoch = False  # also after an epoch that failed: its parameters are neither old nor new
         self._last: dict[str, float] = {}  # the newest epoch's figures, for heartbeats
         # Without it, a learner that waits for its first actor would seem to have no checkpoint since 1970.
         metrics.set("topspin_checkpoint_time_seconds", time.time())
@@ -208,8 +216,9 @@ class LearnerService:
                     self._transport.wait(wait)
             self._member.state = "done"
         except Exception:
-            # The other ranks end too, and their accounts can't be had: the newest checkpoint stays the last one
-            saves = self._group.size == 1
+            # Half an epoch is no state to go on from, and the accounts of the other ranks, which end too, can't be had:
+            # the newest checkpoint stays the last one
+            saves = self._group.size == 1 and not self._is_mid_epoch
             raise
         finally:
             if saves:
@@ -274,7 +283,9 @@ class LearnerService:
     def _train(self, dataset: Sequence[Queued]) -> None:
         self._member.state = "training"
         started = self._clock()
+        self._is_mid_epoch = True
         stats = self.training.run_epoch([entry.rollout for entry in dataset], self._serve)
+        self._is_mid_epoch = False
         clocks, now = self._clocks, self._clock()
         if clocks.first_trained < 0:
             clocks.first_trained = now

@@ -1,7 +1,7 @@
 """Training that starts from a trained policy instead of from new weights: which policies fit, and what is taken over.
 
 The policy brings network, action noise and observation moments, and acts from the first frame on. Its critic is not in
-its folder. So a new one learns first, as after a stage change, and the learning rate starts at its lower bound.
+its folder. So a new one learns first, as after a stage change, and an adaptive learning rate starts at its lower bound.
 """
 
 from collections.abc import Iterator

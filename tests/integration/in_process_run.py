@@ -157,7 +157,7 @@ class LocalRun:
             GeneratorService, GeneratorConfig(**(values | settings)), "generator", new_incarnation()
         )
 
-    def evaluator(self, **settings):
+    def evaluator(self, run=True, **settings):
         values = self.common() | {
             "network": NETWORK,
             "rallies": 20,
@@ -166,7 +166,7 @@ class LocalRun:
             "folder": str(self.folder),
         }
         return self.start(
-            EvaluatorService, EvaluatorConfig(**(values | settings)), "evaluator", new_incarnation()
+            EvaluatorService, EvaluatorConfig(**(values | settings)), "evaluator", new_incarnation(), run=run
         )
 
 

@@ -374,6 +374,24 @@ def test_a_restarted_evaluator_keeps_its_best_policy(tmp_path):
     assert kept == unbeaten
 
 
+def test_an_evaluator_asks_less_and_less_often_while_nothing_is_trained(tmp_path, monkeypatch):
+    asked = []
+    with local_run(tmp_path, curriculum=LONG) as s:
+        s.learner()
+        evaluator = s.evaluator(run=False, interval_s=30.0)
+        request = evaluator.transport.request
+        monkeypatch.setattr(
+            evaluator.transport,
+            "request",
+            lambda *given: (asked.append(time.monotonic()), request(*given))[1],
+        )
+        evaluator.start()
+        wait_until(lambda: len(asked) >= 5, 30, "requests")
+
+    pauses = np.diff(asked[:5])
+    assert list(pauses > [0.2, 0.4, 0.8, 1.6]) == [True] * 4
+
+
 def test_an_evaluator_of_another_task_refuses_the_policy_as_actors_do(tmp_path, caplog):
     """The shapes fit: the evaluator would play with other settings than the policy's, and save a wrong contract."""
     with local_run(tmp_path, curriculum=LONG) as s:

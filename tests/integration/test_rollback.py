@@ -7,6 +7,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
+from services.learner import training as training_module
 from services.learner.checkpoint import checkpoints
 from services.learner.keeper import DivergedError
 from tests.integration.in_process_run import DATASET, LONG, local_run, progress
@@ -55,14 +56,37 @@ def test_the_checkpoint_to_go_back_to_is_of_the_present_stage(tmp_path):
     assert kept == [f"{begun:08d}"]
 
 
+def test_an_update_that_fails_leaves_the_last_checkpoint_as_it_is(tmp_path, monkeypatch):
+    with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=0.01) as s:
+        learner = s.learner()
+        s.generator()
+        s.actor(0, shards=1)
+        wait_until(lambda: progress(learner).epoch >= 3, 60, "epochs")
+        training, update = learner.service.training, training_module.update
+
+        def failing(engine, *rest, **more):
+            update(engine, *rest, **more)  # the parameters have moved
+            raise MemoryError("out of memory")
+
+        monkeypatch.setattr(training_module, "update", failing)
+        with pytest.raises(MemoryError):
+            learner.join(30)
+        newest = checkpoints(tmp_path / "checkpoints")[-1]
+        saved = load_file(newest)
+        moved = {name: values.detach().numpy() for name, values in training.network.named_parameters()}
+
+    assert int(newest.stem) == training.progress.version
+    assert any(not np.array_equal(saved[f"network.{name}"], values) for name, values in moved.items())
+
+
 def test_a_run_that_diverges_without_a_good_checkpoint_ends_with_one_line(tmp_path):
     with local_run(tmp_path, curriculum=LONG, checkpoint_interval_s=1000.0) as s:
         learner = s.learner()
         s.generator()
         s.actor(0, shards=1)
-        policy = tmp_path / "policy" / "latest"  # the last file of a save
-        wait_until(policy.exists, 60, "a checkpoint")
-        wait_until(lambda n=progress(learner).epoch: progress(learner).epoch > n, 30, "an epoch after it")
+        # Each change of stage saves a checkpoint, and after the last one there is none for 1,000 s
+        begun = (LONG.stage_1 + LONG.stage_2) // DATASET
+        wait_until(lambda: progress(learner).epoch > begun + 1, 60, "stage 3")
         shutil.rmtree(tmp_path / "checkpoints" / "good", ignore_errors=True)
         diverge_in_the_next_epoch(learner.service.training)
         with pytest.raises(DivergedError, match="no good checkpoint to go back to"):

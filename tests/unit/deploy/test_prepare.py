@@ -234,6 +234,25 @@ def test_a_run_that_fails_before_it_trained_anything_keeps_its_settings(tmp_path
     assert RunFolder.of("r").config.read_text() != before
 
 
+def test_what_a_killed_process_left_in_the_folder_is_gone_before_anybody_asks_for_actors(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    with prepared(read("--run", "r")) as run:
+        run.folder.targets.write_text("[]")
+        run.folder.wanted_actors.write_text("5\n")
+
+    with prepared(read("--run", "r", "--resume")) as run:
+        assert not run.folder.targets.exists()
+        assert not run.folder.wanted_actors.exists()
+
+
+def test_this_process_waits_for_the_learner_as_long_as_the_services_do(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with prepared(read("--run", "r", "--connect-timeout-s", "300")) as run:
+        assert run.link.connect_timeout_s == 300.0
+
+
 def test_a_new_run_that_trained_nothing_leaves_its_name_and_the_newest_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with prepared(read("--run", "good")):

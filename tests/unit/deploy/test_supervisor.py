@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from common.service.process import BAD_CONFIG
+from common.service.process import BAD_CONFIG, SECOND_SIGNAL_AFTER_S
 from deploy.child import Assignment
 from deploy.supervisor import (
     KEEPER_DEATHS,
@@ -16,6 +16,7 @@ from deploy.supervisor import (
     next_start,
     restart_pause,
 )
+from deploy.topology import ROLES
 from tests.waiting import wait_until
 
 
@@ -149,3 +150,9 @@ def test_the_process_that_keeps_the_run_gets_more_flags_at_a_restart(tmp_path, s
     supervisor.stop(["worker-0"], 5.0)
 
     assert not ended
+
+
+def test_the_second_signal_of_a_learner_whose_workers_end_slowly_does_not_interrupt_its_last_checkpoint():
+    slowest = max(role.grace_s for role in ROLES if role.name != "learner")
+
+    assert SECOND_SIGNAL_AFTER_S[signal.SIGTERM] > slowest

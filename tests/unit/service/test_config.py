@@ -1,4 +1,5 @@
 import tomllib
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import pytest
@@ -6,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from common.errors import ConfigError, HelpRequest
 from common.service.config import load, save_settings, to_tables
-from common.service.config_sources import SHARED, TABLES
+from common.service.config_sources import SHARED, TABLES, named_file
 
 
 class Frozen(BaseModel):
@@ -335,4 +336,31 @@ def test_flags_variables_and_a_named_file_override_recorded_settings(toml, tmp_p
 
     assert found() == found(TOPSPIN_CONFIG=named) == (3, 3)
     assert found("--max-lag", "5") == found(TOPSPIN_LEARNER__MAX_LAG="5") == (5, 3)
-    assert found("--config", named) == (4, 1)
+    assert found("--config", named) == (4, 3)
+
+
+@pytest.mark.parametrize(
+    ("argv", "environ", "file"),
+    [
+        ((), {}, None),
+        (("--run", "r"), {"TOPSPIN_CONFIG": "e.toml"}, "e.toml"),
+        (("--config", "a.toml", "--run", "r"), {"TOPSPIN_CONFIG": "e.toml"}, "a.toml"),
+        (("--config", "a.toml", "--config=b.toml"), {}, "b.toml"),
+    ],
+)
+def test_the_named_file_is_the_flags_or_else_the_environments(argv, environ, file):
+    assert named_file(argv, environ) == (Path(file) if file else None)
+
+
+def test_settings_beneath_count_where_nothing_else_gives_a_value(toml, tmp_path):
+    beneath = tmp_path / "beneath.toml"
+    save_settings(beneath, {"learner": {"max_lag": 3, "stage": 3}})
+    named = toml("[learner]\nmax_lag = 4")
+
+    def found(*argv, **environ):
+        settings = load(Learner, argv, prog="p", section="learner", environ=environ, beneath=beneath)
+        return settings.max_lag, settings.stage
+
+    assert found() == (3, 3)
+    assert found("--config", named) == found(TOPSPIN_CONFIG=named) == (4, 3)
+    assert found("--max-lag", "5") == (5, 3)

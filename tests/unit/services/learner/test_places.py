@@ -51,6 +51,13 @@ def test_a_name_without_a_number_keeps_the_one_that_it_was_given_while_its_actor
     assert places.give("gpu-box", {"1"}, 4.0 * HELD_S) == ("gpu-box", 0)  # it has gone, and comes again
 
 
+def test_the_numbers_of_a_checkpoints_actors_are_held_until_their_tokens_can_have_come():
+    places = Places(["0", "gpu-2", "desk"], now=100.0)
+    assert [places.give("", set(), 101.0) for _ in range(2)] == [("1", 1), ("3", 3)]
+    assert places.give("gpu-2", set(), 102.0) == ("gpu-2", 2)
+    assert places.give("", {"1", "3", "gpu-2"}, 100.0 + HELD_S + 1.0) == ("0", 0)
+
+
 def test_two_names_with_one_number_get_two(caplog):
     places = Places()
     assert places.give("east-0", set(), 0.0) == ("east-0", 0)
