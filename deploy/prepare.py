@@ -177,11 +177,9 @@ def prepared(config: DeployConfig) -> Iterator[PreparedRun]:
     folder = RunFolder.of(name)
     with folder.held_by("deploy.local"):
         folder.check_free_of("learner")  # one that was started by hand, or is left of an earlier run
-        for left in (
-            folder.targets,
-            folder.wanted_actors,
-        ):  # of a life that was killed: nobody reads what is asked for
-            left.unlink(missing_ok=True)
+        # Of a life that was killed: while they are there, `topspin scale` promises what nobody reads
+        folder.targets.unlink(missing_ok=True)
+        folder.wanted_actors.unlink(missing_ok=True)
         before, trained = read_toml(folder.config) if config.resume else {}, last_epoch(folder)
         newest = newest_run()
         write(config, name, folder, link.endpoint)
