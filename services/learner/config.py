@@ -104,7 +104,7 @@ class CurriculumConfig(BaseModel):
         1_000_000, ge=0, description="length of stage 2, hitting", json_schema_extra={"unit": "frames"}
     )
     stage_3: int = Field(
-        117_000_000, ge=0, description="length of stage 3, aiming", json_schema_extra={"unit": "frames"}
+        117_000_000, ge=1, description="length of stage 3, aiming", json_schema_extra={"unit": "frames"}
     )
     stage_shares: tuple[float, ...] = Field(
         (),

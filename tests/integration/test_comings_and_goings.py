@@ -405,7 +405,7 @@ def test_an_evaluator_of_another_task_refuses_the_policy_as_actors_do(tmp_path, 
 
 
 def test_an_actor_that_runs_out_of_rallies_logs_it_once(tmp_path, caplog):
-    curriculum = CURRICULUM.model_copy(update={"stage_1": 40 * DATASET, "stage_2": 0, "stage_3": 0})
+    curriculum = CURRICULUM.model_copy(update={"stage_1": 40 * DATASET, "stage_2": 0})
     with caplog.at_level(logging.INFO), local_run(tmp_path, curriculum=curriculum) as s:
         s.learner()
         s.generator(shards=1, batch=16, rate_hz=0.1)  # enough for the start, and then none
