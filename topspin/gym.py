@@ -14,7 +14,7 @@ say. Every rally is an episode that is played to its end, unless ``end_at_hit_sh
 
 import difflib
 from collections.abc import Mapping
-from typing import Any, Final, NoReturn, TypeVar
+from typing import Any, Final, NoReturn, TypeVar, cast
 
 import gymnasium
 import numpy as np
@@ -62,8 +62,12 @@ def _of_settings(model: type[_Model], given: dict[str, Any]) -> _Model:
         first = error.errors()[0]
         name = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            known = (*TaskConfig.model_fields, *_EPISODES)
-            nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            *parents, unknown = name.split(".")
+            inner: type[BaseModel] = TaskConfig
+            for parent in parents:
+                inner = cast(type[BaseModel], inner.model_fields[parent].annotation)
+            known = tuple(inner.model_fields) if parents else (*TaskConfig.model_fields, *_EPISODES)
+            nearest = difflib.get_close_matches(unknown, known, n=1, cutoff=0.5)
             hint = f"did you mean {nearest[0]!r}?" if nearest else f"allowed: {', '.join(known)}"
             raise ValueError(f"unknown setting {name!r}; {hint}") from None
         raise ValueError(f"{name or 'settings'} = {first['input']!r}; {first['msg']}") from None
@@ -76,7 +80,7 @@ def check_choices(render_mode: str | None, modes: list[str], stage: int) -> None
         raise ValueError(
             f"render_mode {render_mode!r}; allowed: {allowed} (films: topspin play --video FILE)"
         )
-    if stage not in (1, 2, 3):
+    if not isinstance(stage, int | np.integer) or stage not in (1, 2, 3):
         raise ValueError(f"stage {stage!r}; allowed: 1, 2, 3")
 
 
@@ -86,7 +90,7 @@ class RallyBatch:
     Args:
         count: B.
         stage: Curriculum stage 1..3.
-        settings: Fields of ``TaskConfig`` and ``ExperienceConfig``, over ``DEFAULTS``.
+        settings: Fields of ``TaskConfig``, ``end_at_hit_share`` and ``continue_share``, over ``DEFAULTS``.
         options: More arguments of ``RallyEnv``.
     """
 
@@ -214,6 +218,8 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         """Play one control step."""
         if self._next_obs is not None:
             raise gymnasium.error.ResetNeeded("step() after the episode's end: call reset() first")
+        if np.shape(action) != ACTION_SPACE.shape:
+            raise ValueError(f"action of shape {np.shape(action)}; allowed: {ACTION_SPACE.shape}")
         step = self._batch.started.step(np.asarray(action)[None])
         obs = step.obs
         if step.ended.size:

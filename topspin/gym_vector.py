@@ -64,7 +64,7 @@ class RallyVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         check_choices(render_mode, self.metadata["render_modes"], stage)
         for name, count in (("num_envs", num_envs), ("threads", threads)):
-            if count < 1:
+            if not isinstance(count, int | np.integer) or count < 1:
                 raise ValueError(f"{name} {count!r}; allowed: a whole number from 1")
         if autoreset_mode not in (*AUTORESET, *(mode.value for mode in AUTORESET)):
             raise ValueError(f"autoreset_mode {autoreset_mode}; allowed: {', '.join(map(str, AUTORESET))}")

@@ -7,7 +7,7 @@ from common.rally.observer import BallSample
 from common.rally.observer import Observer as RallyObserver
 from common.robot.chain_of import chain_of
 from common.task.config import TaskConfig
-from common.task.randomization import PROFILES
+from common.task.randomization import profile_of
 
 
 class Observer(RallyObserver):
@@ -15,8 +15,8 @@ class Observer(RallyObserver):
 
     Args:
         task: The policy's: ``policy.contract.task``.
-        position_noise: Standard deviation of a sample's position per axis [m]; default: as in training.
-        velocity_noise: Standard deviation of its velocity per axis [m/s].
+        position_noise: Standard deviation of a sample's position per axis [m]; None: as in the task's randomization.
+        velocity_noise: Standard deviation of its velocity per axis [m/s]; None: the same.
 
     Raises:
         ValueError: The policy observes the ball's true spin, which no robot can measure.
@@ -26,10 +26,16 @@ class Observer(RallyObserver):
     def __init__(
         self,
         task: TaskConfig,
-        position_noise: float = PROFILES["standard"].position_noise,
-        velocity_noise: float = PROFILES["standard"].velocity_noise,
+        position_noise: float | None = None,
+        velocity_noise: float | None = None,
     ) -> None:
-        super().__init__(task.observation, chain_of(task.robot), position_noise, velocity_noise)
+        profile = profile_of(task.randomization, task.rubber)
+        super().__init__(
+            task.observation,
+            chain_of(task.robot),
+            profile.position_noise if position_noise is None else position_noise,
+            profile.velocity_noise if velocity_noise is None else velocity_noise,
+        )
         self._task = task
 
     def warm_up(self) -> float:

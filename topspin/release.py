@@ -68,7 +68,12 @@ def main(argv: Sequence[str], stop: Event) -> int:
     target = Path(config.box) / config.name
     if target.exists() and not config.replace:
         raise ConfigError(f"{target} exists; allowed: another --name, or --replace")
-    policies = [load_policy(policy_folder(given)) for given in config.policy.split(",")]
+    names = [name.strip() for name in config.policy.split(",")]
+    if not all(names):
+        raise ConfigError(
+            f"--policy {config.policy!r} has an empty name; allowed: policies, separated by commas"
+        )
+    policies = [load_policy(policy_folder(name)) for name in names]
     policy = mean_policy(policies) if len(policies) > 1 else policies[0]
     contract = policy.contract.expecting(config.expected_spin)
     found: dict[str, Any] = {}

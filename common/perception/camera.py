@@ -91,7 +91,7 @@ def detect_along_flight(
     Args:
         buffer: Of one ball (DETECTION_BUFFER,); written.
         seed: Of the rally.
-        parameters: ``randomization.RallyParameter`` of the rally (15,).
+        parameters: ``randomization.RallyParameter`` of the rally (RALLY_PARAMETERS,).
         profile: Noise, rate and losses.
         start: Start of the segment [s since launch].
         segment: The piece of flight; at most a grid step long.

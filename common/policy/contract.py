@@ -56,9 +56,17 @@ class Contract(BaseModel):
         return not observation.is_tracked and observation.spin == "hidden"
 
     def expecting(self, spin: ExpectedSpin | Literal["contract"]) -> Self:
-        """Return the contract with another expected spin than in training; ``contract`` returns it as it is."""
+        """Return the contract with another expected spin than in training; ``contract`` returns it as it is.
+
+        Raises:
+            PolicyError: The policy observes nothing that depends on it.
+        """
         if spin == "contract":
             return self
+        if not self.task.observation.is_tracked:
+            raise PolicyError(
+                f"expected_spin {spin!r} for a policy without a flight filter; allowed: 'contract'"
+            )
         observation = self.task.observation.model_copy(update={"expected_spin": spin})
         return self.model_copy(update={"task": self.task.model_copy(update={"observation": observation})})
 

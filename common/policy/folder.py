@@ -184,7 +184,7 @@ def _digest(content: bytes) -> str:
 def _shape(contract: Contract) -> dict[str, Any]:
     """Return what must be equal in the contracts of policies that are averaged."""
     return {
-        "observation": [(part["name"], part["size"]) for part in contract.observation],
+        "observation": contract.task.observation.model_dump(exclude={"critic"}),
         "network": contract.network,
         "control_rate_hz": contract.task.control_rate_hz,
         "robot": contract.task.robot,

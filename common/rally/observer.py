@@ -55,7 +55,7 @@ class Observer:
     Args:
         options: What the policy observes: ``contract.task.observation``.
         chain: Of the robot.
-        position_noise: Standard deviation of a sample's position per axis [m]; default: as in training.
+        position_noise: Standard deviation of a sample's position per axis [m]; default: randomization `standard`.
         velocity_noise: Standard deviation of its velocity per axis [m/s].
 
     Raises:

@@ -2,8 +2,9 @@
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from common.errors import ConfigError
 from common.physics.constants import GRID_STEP
 from common.physics.flight_model import Flight
 from common.task.observation import ObservationConfig
@@ -168,6 +169,15 @@ class TaskConfig(MatchConditions):
         return round(1.0 / (self.control_rate_hz * GRID_STEP))
 
     def under(self, conditions: PlayConditions) -> "TaskConfig":
-        """Return the task with all settings of ``conditions``; every other setting stays."""
+        """Return the task with all settings of ``conditions``; every other setting stays.
+
+        Raises:
+            ConfigError: There is no such task, such as this one's rubber with MuJoCo's contacts.
+        """
         names = type(conditions).model_fields.keys() & MatchConditions.model_fields.keys()
-        return self.model_copy(update={name: getattr(conditions, name) for name in names})
+        try:
+            return type(self).model_validate(
+                self.model_dump() | {name: getattr(conditions, name) for name in names}
+            )
+        except ValidationError as error:
+            raise ConfigError(error.errors()[0]["msg"].removeprefix("Value error, ")) from None

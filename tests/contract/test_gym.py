@@ -228,10 +228,17 @@ def test_results_do_not_depend_on_the_number_of_threads(mode, collision):
             np.testing.assert_array_equal(got, wanted)
 
 
-@pytest.mark.parametrize("settings", [{"threads": 0}, {"num_envs": 0}])
-def test_a_count_below_one_is_refused(settings):
-    with pytest.raises(ValueError, match=r"(threads|num_envs) 0; allowed: a whole number from 1"):
+@pytest.mark.parametrize("settings", [{"threads": 0}, {"num_envs": 0}, {"num_envs": 2.5}, {"num_envs": "8"}])
+def test_a_count_below_one_or_no_whole_number_is_refused(settings):
+    with pytest.raises(ValueError, match=r"(threads|num_envs) .*; allowed: a whole number from 1"):
         make_vec(**settings)
+
+
+def test_an_action_of_another_shape_is_refused_in_the_users_own_shapes():
+    env = make()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action of shape \(6,\); allowed: \(7,\)"):
+        env.unwrapped.step(np.zeros(6, np.float32))
 
 
 def test_the_batch_has_the_spaces_of_its_environments():
@@ -424,6 +431,9 @@ def test_a_seed_for_each_environment_repeats_the_episodes():
         ({"launch": "wild"}, "launch = 'wild'; Input should be 'paper', 'strong'"),
         ({"launsh": "paper"}, "unknown setting 'launsh'; did you mean 'launch'"),
         ({"stage": 4}, "stage 4; allowed: 1, 2, 3"),
+        ({"stage": 3.0}, "stage 3.0; allowed: 1, 2, 3"),
+        ({"observation": {"hist": 3}}, "unknown setting 'observation.hist'; did you mean 'history'"),
+        ({"reward": {"torqe": 1}}, "unknown setting 'reward.torqe'; did you mean 'torque'"),
         ({"control_rate_hz": 60}, "control_rate_hz = 60; Input should be 25, 50, 100 or 200"),
         ({"continue_share": 2.0}, "continue_share = 2.0; Input should be less than or equal to 1"),
     ],

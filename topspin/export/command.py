@@ -10,6 +10,7 @@ from typing import ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from common.errors import ConfigError
 from common.evaluation.config import MatchSpin
 from common.service.config import load
 from common.service.log import set_up_logging
@@ -38,7 +39,7 @@ class ExportConfig(BaseModel):
     policy: str = Field(
         "default", description="a policy of the box, or a policy folder: runs/NAME/policy/latest"
     )
-    out: str = Field("exported", min_length=1, description="folder to write; it must be new or empty")
+    out: str = Field("", description="folder to write; it must be new or empty; empty: exported")
     web: str = Field(
         "",
         description="write a page that plays the policy in a browser into this new or empty folder, instead of --out; "
@@ -56,7 +57,9 @@ def main(argv: Sequence[str], _stop: Event) -> int:
     from common.policy.folder import load_policy
     from topspin.export.folder import check_free, export_policy
 
-    out = Path(config.web or config.out)
+    if config.web and config.out:
+        raise ConfigError(f"--out {config.out} and --web {config.web}; allowed: one of them")
+    out = Path(config.web or config.out or "exported")
     check_free(out, "--web" if config.web else "--out")
     source = policy_folder(config.policy)
     policy = load_policy(source)

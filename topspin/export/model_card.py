@@ -21,7 +21,14 @@ _LIMITS: Final = (
 def exam_rows(contract: RobotContract) -> list[dict[str, Any]]:
     """Return one row for each exam in the contract: the balls, the conditions, and what was found."""
     rows = []
-    for name, found in contract.measures.items():
+    exams = dict(contract.measures)
+    if "return_rate" in exams:  # a run's own evaluator has measured it, once, as it was trained
+        match = exams.pop("match", {})
+        as_trained = {
+            name: contract.trained[name] for name in ("launch", "flight", "randomization", "perception")
+        }
+        exams = {"in its run": as_trained | exams | match}
+    for name, found in exams.items():
         if not isinstance(found, dict) or "return_rate" not in found:
             continue
         rows.append(

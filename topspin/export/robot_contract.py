@@ -1,5 +1,8 @@
 """The contract of an exported policy, made from the policy's own contract and the robot's description."""
 
+from collections.abc import Mapping
+from typing import Any
+
 from common.physics.chain import IS_HINGE, Chain
 from common.policy.contract import Contract
 from common.robot.chain_of import chain_of
@@ -56,9 +59,18 @@ def robot_contract(contract: Contract, name: str, policy_sha256: str) -> RobotCo
             "lost_samples": profile.loss,
             "gain_factor": profile.gain_factor,
         },
-        measures=contract.measures,
+        measures=measured_as(contract.measures, task.observation.expected_spin),
         made_with=contract.made_with,
     )
+
+
+def measured_as(measures: Mapping[str, Any], expected_spin: str) -> dict[str, Any]:
+    """Return the measures of an observer that expects this spin; others are those of another program."""
+    return {
+        name: found
+        for name, found in measures.items()
+        if not isinstance(found, Mapping) or found.get("expected_spin", expected_spin) == expected_spin
+    }
 
 
 def _joint(drive: JointDrive, chain: Chain, index: int) -> Joint:

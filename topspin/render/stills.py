@@ -28,6 +28,7 @@ _STRIP_SHARE: Final = {
     1: 1.0,
     2: 0.5,
     3: 0.25,
+    4: 0.6,
 }  # share of each part's duration at which the strip's picture is taken
 _CLOSE: Final = 1.75  # [m] from the strip's camera to the ball
 _GAP: Final = 8  # [pixels] between the strip's pictures
@@ -38,13 +39,14 @@ def showpiece(rallies: Sequence[RecordedRally]) -> RecordedRally:
     returned = [rally for rally in rallies if rally.outcome == Outcome.RETURNED]
     if returned:
         return min(returned, key=lambda rally: rally.landing_error)
-    return max(rallies, key=lambda rally: (int(rally.state.max()), len(rally.time)))
+    return max(rallies, key=lambda rally: (len(part_times(rally)), len(rally.time)))
 
 
 def part_times(rally: RecordedRally) -> dict[int, tuple[float, float]]:
-    """Return the start and end [s] of each state that the rally reached."""
+    """Return the start and end [s] of each state that the rally reached, in the order of time."""
     times = {int(s): rally.time[rally.state == s] for s in np.unique(rally.state)}
-    return {state: (float(time[0]), float(time[-1])) for state, time in times.items()}
+    parts = [(float(time[0]), float(time[-1]), state) for state, time in times.items()]
+    return {state: (start, end) for start, end, state in sorted(parts)}
 
 
 def rally_picture(rally: RecordedRally, camera: CameraName, width: int, height: int) -> Image:
@@ -73,7 +75,7 @@ def rally_picture(rally: RecordedRally, camera: CameraName, width: int, height: 
 
 
 def rally_strip(rally: RecordedRally, width: int, height: int) -> Image:
-    """Return the parts of a rally side by side, each (height, width, 3): coming, bounced, hit, landed."""
+    """Return the parts of a rally side by side, each (height, width, 3): (served,) coming, bounced, hit, landed."""
     path, scale = path_of(rally), OVERSAMPLED
     lettering = Lettering(3 * height * scale)
     parts = []

@@ -45,8 +45,9 @@ def sections(found: Results, drawings: Sequence[Drawing]) -> list[Section]:
             (
                 f"Every policy plays the same {config.rallies:,} rallies (launch {config.launch}, randomization "
                 f"{config.randomization}, air {config.flight}, perception {config.perception}, collision "
-                f"{config.collision}, seed {config.seed} of the evaluation's own seeds), without exploration noise and "
-                "to their end. Runs that differ only in their seed are one group.",
+                f"{config.collision}, seed {config.seed} of the evaluation's own seeds, rounds "
+                f"{config.rounds}, expected spin {config.expected_spin}), without exploration noise and to their end. "
+                "Runs that differ only in their seed are one group.",
             ),
         ),
         Section("In words", note(config.note)),

@@ -60,6 +60,8 @@ def main(argv: Sequence[str]) -> int:
         "--steps", type=int, default=2000, metavar="N", help="control steps to time (default: 2000)"
     )
     arguments = parser.parse_args(argv)
+    if arguments.steps < 1:
+        parser.error(f"--steps {arguments.steps}; allowed: a whole number from 1")
     started = time.perf_counter()
     try:
         controller = load(arguments.folder)
@@ -68,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
         return 1
     ready = time.perf_counter() - started
     contract = controller.contract
-    taken = 1e3 * np.array(time_steps(controller, max(arguments.steps, 1)))
+    taken = 1e3 * np.array(time_steps(controller, arguments.steps))
     median, slow = np.percentile(taken, [50, 99])
     lines = [
         f"policy {contract.policy} for robot {contract.robot}: {contract.size} numbers in, {JOINTS} joint targets out",

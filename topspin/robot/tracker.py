@@ -41,9 +41,10 @@ class BallTracker:
         self.newest = -math.inf  # [s] stamp of the newest detection or sample
 
     def add(self, moment: float, pos: Position) -> None:
-        """Add a camera's detection, newer than the one before."""
+        """Add a camera's detection, newer than the one before. It takes the place of a sample that was given."""
         noise = self._filters.camera_noise
-        if math.isinf(self.newest):
+        self._sample = None
+        if math.isnan(self._first):
             begin_filter(self._row, moment, pos, noise, SERVED if self._served else COMING)
             self._first = moment
         else:

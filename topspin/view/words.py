@@ -1,5 +1,6 @@
 """The page's texts, as HTML: a function of the rally, the score and the pace."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -105,7 +106,9 @@ def progress(curves: Curves) -> str:
     """Return how far a training is."""
     newest = "no evaluation yet"
     if len(curves.minutes):
-        newest = f"{curves.return_rate[-1]:.1f} % returned, {curves.landing_error[-1]:.0f} cm from the target"
+        newest = f"{curves.return_rate[-1]:.1f} % returned"
+        if math.isfinite(error := curves.landing_error[-1]):  # nan: nothing has landed on the court
+            newest += f", {error:.0f} cm from the target"
     rows = [
         ("Frames", f"{curves.frames / 1e6:.1f} M"),
         ("Stage", str(curves.stage or "–")),

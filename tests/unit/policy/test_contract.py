@@ -3,7 +3,7 @@
 import pytest
 
 from common.policy.config import NetworkConfig
-from common.policy.contract import contract_of
+from common.policy.contract import PolicyError, contract_of
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import PAPER_OBSERVATION
@@ -29,3 +29,13 @@ def test_a_policy_that_is_fed_a_prediction_spin_or_a_filtered_ball_is_not_end_to
     )
 
     assert contract.is_end_to_end == is_end_to_end
+
+
+def test_an_expected_spin_is_refused_where_nothing_observed_depends_on_it():
+    where = {"generation": 1, "version": 1, "stage": 3, "frames": 1}
+    task = TaskConfig(observation=PAPER_OBSERVATION)
+    contract = contract_of(task, ExperienceConfig(), NetworkConfig(), run="r", **where)
+
+    assert contract.expecting("contract") is contract
+    with pytest.raises(PolicyError, match="expected_spin 'strong' for a policy without a flight filter"):
+        contract.expecting("strong")

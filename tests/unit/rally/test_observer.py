@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import topspin
 from common.env.rally_env import RallyEnv
 from common.perception.camera import DETECTION_BUFFER
 from common.perception.camera_filter import is_guess
@@ -16,7 +17,7 @@ from common.robot.description import describe
 from common.task.config import TaskConfig
 from common.task.launch import draw_rallies
 from common.task.observation import ObservationConfig, policy_layout, size
-from common.task.randomization import RallyParameter
+from common.task.randomization import RallyParameter, profile_of
 from tests.unit.env.rallies import PLAYED_OUT, Deck, random_actions
 
 CHAIN = chain_of("rails")
@@ -140,3 +141,12 @@ def test_a_policy_names_the_shape_that_it_needs(shape):
 def test_a_policy_that_observes_the_true_spin_is_refused():
     with pytest.raises(ValueError, match=r"spin 'true' can't be measured"):
         Observer(ObservationConfig(spin="true"), CHAIN)
+
+
+@pytest.mark.parametrize("randomization", ["off", "standard", "hard"])
+def test_a_robots_observer_assumes_the_noise_of_its_policys_training(randomization):
+    profile = profile_of(randomization)
+    found = topspin.Observer(TaskConfig(randomization=randomization))
+
+    assert found._noise == (profile.position_noise, profile.velocity_noise)
+    assert topspin.Observer(TaskConfig(randomization=randomization), 0.004, 0.2)._noise == (0.004, 0.2)

@@ -3,6 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
+from common.errors import ConfigError
 from common.physics.constants import GRID_STEP
 from common.physics.flight_model import Flight
 from common.task.config import PAPER_REWARD, MatchConditions, PlayConditions, RewardConfig, TaskConfig
@@ -22,7 +23,6 @@ MATCH = MatchConditions(
 def test_a_task_under_the_conditions_of_a_match_takes_them_all_and_nothing_else():
     task = TaskConfig(
         robot="usst",
-        rubber="long_pips",
         control_rate_hz=100,
         carry_over=0.25,
         reset_spread=0.2,
@@ -101,3 +101,11 @@ def test_a_rate_whose_control_step_is_not_on_the_grid_is_refused(rate):
 def test_an_unknown_setting_or_value_is_refused(setting):
     with pytest.raises(ValidationError, match=next(iter(setting))):
         TaskConfig.model_validate(setting)
+
+
+def test_conditions_that_make_no_task_are_refused():
+    task = TaskConfig(rubber="anti_spin")
+
+    assert task.under(MatchConditions(launch="strong")).launch == "strong"
+    with pytest.raises(ConfigError, match="rubber anti_spin with collision original"):
+        task.under(MatchConditions(collision="original"))

@@ -1,6 +1,7 @@
 """A released policy: measured on every exam, readable, and unchanged."""
 
 import json
+from dataclasses import replace
 from threading import Event
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from common.errors import ConfigError
 from common.policy.contract import PolicyError
-from common.policy.folder import load_policy, save_policy
+from common.policy.folder import load_policy, mean_policy, save_policy
 from tests.unit.evaluation.test_match import make_policy
 from topspin import release
 
@@ -78,7 +79,7 @@ def test_a_policy_can_be_released_with_another_expected_spin_and_is_measured_wit
 def test_of_several_policies_the_mean_is_released(box, one_exam):
     one, other = put_policy(box / "one"), put_policy(box / "other")
 
-    release.main(["--policy", "one,other", "--name", "mine", "--rallies", "4", "--box", "box"], Event())
+    release.main(["--policy", "one, other", "--name", "mine", "--rallies", "4", "--box", "box"], Event())
 
     released = load_policy(box / "box" / "mine")
     parts = [policy.network.state_dict()["mean.weight"].numpy() for policy in (one, other)]
@@ -113,3 +114,22 @@ def test_a_policy_of_the_box_is_replaced_only_on_request(box, one_exam):
 
     assert release.main([*flags, "--replace"], Event()) == 0
     assert load_policy(mine).contract.measures["paper"]["rallies"] == 4
+
+
+@pytest.mark.parametrize("given", ["one,", ",one", "one, ,other"])
+def test_an_empty_name_among_several_policies_is_refused(box, given):
+    with pytest.raises(ConfigError, match="has an empty name; allowed: policies, separated by commas"):
+        release.main(["--policy", given, "--name", "mine", "--rallies", "4", "--box", "box"], Event())
+
+
+def test_policies_that_observe_other_quantities_have_no_mean():
+    policy = make_policy()
+    observation = policy.contract.task.observation
+    ball = "filtered" if observation.ball == "sampled" else "sampled"
+    task = policy.contract.task.model_copy(
+        update={"observation": observation.model_copy(update={"ball": ball})}
+    )
+    other = replace(policy, contract=policy.contract.model_copy(update={"task": task}))
+
+    with pytest.raises(PolicyError, match="observation"):
+        mean_policy([policy, other])

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 
@@ -113,6 +114,22 @@ def test_the_card_has_metadata_and_every_measured_figure(tmp_path):
     assert all(joint.name in text for joint in contract.joints)
 
 
+def test_the_card_of_a_runs_policy_has_what_its_evaluator_measured(tmp_path):
+    policy = small_policy()
+    measures = {"return_rate": 0.8125, "return_rate_ci": [0.79, 0.83], "target_error_mean": 0.31}
+    match = {"match": {"rallies": 1000, "rounds": 1}}
+    policy = replace(policy, contract=policy.contract.model_copy(update={"measures": measures | match}))
+    contract, _ = export(policy, tmp_path / "out", "mine")
+
+    (row,) = exam_rows(contract)
+    assert (row["exam"], row["balls"], row["return_rate"]) == (
+        "in its run",
+        "1000 `paper`, 1 in a row",
+        0.8125,
+    )
+    assert "| in its run | 1000 `paper`, 1 in a row |" in (tmp_path / "out" / "README.md").read_text()
+
+
 def test_the_card_of_a_policy_without_measures_says_so(small):
     _, out = small
 
@@ -175,6 +192,7 @@ def test_the_command_says_what_it_wrote(small, tmp_path, monkeypatch, capsys):
         ),
         (["--out", "file"], "file is no folder; allowed: a new or an empty folder"),
         (["--out", "file/in"], "can't write beside file/in"),
+        (["--out", "a", "--web", "b"], "--out a and --web b; allowed: one of them"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(flags, line, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ from tests.unit.topspin.render.recorded import make_rally, make_recorded
 from topspin.render.film import AROUND_HIT_S, FilmOptions, caption_at, picture_times
 from topspin.render.replay import moment_at, path_of, path_until, position_at, spin_word
 from topspin.render.scene import corners_of
-from topspin.render.stills import part_times
+from topspin.render.stills import _STRIP_SHARE, part_times, showpiece
 
 
 def test_the_path_bends_on_the_table_not_between_two_samples():
@@ -119,3 +119,12 @@ def test_a_rallys_parts_follow_one_another():
         assert list(parts) == list(range(int(rally.state.max()) + 1))
         for state in list(parts)[1:]:
             assert parts[state][0] == pytest.approx(parts[state - 1][1] + 0.005)
+
+
+def test_the_parts_of_a_served_ball_begin_with_the_serve():
+    served = make_rally(9, state=np.array([4, 4, 4, 0, 0, 1, 1, 2, 3]))
+    bounced = make_rally(9, state=np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]))
+
+    assert list(part_times(served)) == [4, 0, 1, 2, 3]
+    assert set(_STRIP_SHARE) >= set(part_times(served))
+    assert showpiece([make_rally(9, state=np.array([4] * 9)), bounced]) is bounced

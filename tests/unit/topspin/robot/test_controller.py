@@ -316,3 +316,17 @@ def edit(out, old, new):
     text = (out / "contract.json").read_text()
     assert old in text
     (out / "contract.json").write_text(text.replace(old, new, 1))
+
+
+def test_a_detection_takes_the_place_of_a_sample_of_the_same_ball(controller):
+    home = controller.contract.of_joints("home")
+    controller.begin((0.9, 0.0))
+    controller.measure(BallSample((0.5, 0.0, 0.3), (-5.0, 0.0, 0.0), 0, 0.0))
+    assert controller.step(0.0, home, [0.0] * 7).is_new
+    for k in range(1, 40):
+        controller.see(0.01 * k, (0.5 - 0.02 * k, 0.0, 0.3))
+    before = controller.step(0.4, home, [0.0] * 7)
+    after = controller.step(0.4 + MAX_AGE + 0.1, home, [0.0] * 7)
+
+    assert before.is_new
+    assert not after.is_new  # the ball of the detections is lost; the sample is not played for ever
