@@ -29,7 +29,10 @@ from services.evaluator.config import EvaluatorConfig
 log = logging.getLogger(__name__)
 
 IDLE_WAIT_S: Final = 0.2
-LONGEST_PAUSE_S: Final = 5.0  # between requests while the learner has nothing new: a policy has 0.4 to 2 MB
+QUIET_AFTER_S: Final = (
+    60.0  # without a new policy: then the learner is asked less often, since a policy has 0.4 to 2 MB
+)
+QUIET_PAUSE_S: Final = 5.0
 ANSWER_S: Final = 5.0  # limit for the learner's answer with the policy
 _RATES: Final = (
     *("catch_rate", "over_rate", "return_rate", "return_after_catch"),
@@ -75,7 +78,7 @@ class EvaluatorService:
         self._stop = Event()
         self._born = clock()
         self._next_play = self._born
-        self._pause_s = IDLE_WAIT_S  # before the next request where the last one brought nothing new
+        self._newest = self._born  # [s] time of the last new policy
         self._asked: PendingReply | None = None
         self._last: dict[str, float] = {}
         self.evaluations = 0
@@ -108,8 +111,7 @@ class EvaluatorService:
         answer = self._asked.poll() if self._asked else None
         if answer is not None:
             self._asked = None
-            self._next_play = now + self._pause_s
-            self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S, self._config.interval_s)
+            self._next_play = now + (IDLE_WAIT_S if now - self._newest < QUIET_AFTER_S else QUIET_PAUSE_S)
             snapshot = self._read(answer.payload) if isinstance(answer, Reply) else None
             if snapshot and (snapshot.generation, snapshot.version) != self._played:
                 self._take(snapshot)
@@ -154,7 +156,8 @@ class EvaluatorService:
             self._member.state = "playing"
             self._evaluate(snapshot, moments)
             self._member.state = "waiting"
-        self._next_play, self._pause_s = self._clock() + self._config.interval_s, IDLE_WAIT_S
+        self._newest = self._clock()
+        self._next_play = self._newest + self._config.interval_s
 
     def _installed(self, snapshot: PolicySnapshot) -> Moments | None:
         """Return the moments of a policy whose weights the network has now, or None if it is refused."""
