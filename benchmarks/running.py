@@ -2,15 +2,11 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final
 
 from common.errors import ReportedError
 from deploy.prepare import PreparedRun
-from deploy.run import LEARNER
+from deploy.run import LEARNER, end
 from deploy.supervisor import Supervisor
-
-WORKER_PATIENCE_S: Final = 10.0
-LEARNER_PATIENCE_S: Final = 30.0
 
 
 @contextmanager
@@ -20,8 +16,7 @@ def running(run: PreparedRun) -> Iterator[Supervisor]:
     try:
         yield supervisor
     finally:
-        supervisor.stop([name for name in supervisor.children if name != LEARNER], WORKER_PATIENCE_S)
-        supervisor.stop([LEARNER], LEARNER_PATIENCE_S)
+        end(supervisor, workers_first=True)
 
 
 def check_learner(run: PreparedRun, supervisor: Supervisor) -> None:

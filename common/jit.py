@@ -150,18 +150,24 @@ _said: set[tuple[str, str]] = set()
 
 def _say_that_it_compiles() -> None:
     """Log that this process compiles, before the first kernel: a start that is silent for minutes looks dead."""
-    folder: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    if (folder, _COMPILES) not in _said:
-        _said.add((folder, _COMPILES))
-        log.info("%s folder=%s", _COMPILES, folder)
+    if _is_new(_COMPILES):
+        log.info("%s folder=%s", _COMPILES, numba.config.CACHE_DIR)  # type: ignore[attr-defined]
 
 
 def _say_once(what: str, error: Exception) -> None:
     """Log what is wrong with the cache: one line, however many kernels there are."""
-    folder: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
-    if (folder, what) not in _said:
-        _said.add((folder, what))
+    if _is_new(what):
+        folder: str = numba.config.CACHE_DIR  # type: ignore[attr-defined]
         log.warning("%s folder=%s reason=%s: %s", what, folder, type(error).__name__, error)
+
+
+def _is_new(what: str) -> bool:
+    """Return whether this has not been said of the cache folder yet; it counts as said from now on."""
+    said = (str(numba.config.CACHE_DIR), what)  # type: ignore[attr-defined]
+    if said in _said:
+        return False
+    _said.add(said)
+    return True
 
 
 def seed_cache(folder: Path, prebuilt: Path) -> None:

@@ -134,11 +134,11 @@ def end_hung(watchdog: Watchdog, supervisor: Supervisor, view: View, now: float)
         supervisor.kill(name)
 
 
-def end(supervisor: Supervisor, stop: Event) -> None:
-    """End all processes. In an interrupted run the actors end first, while the learner still answers."""
+def end(supervisor: Supervisor, workers_first: bool) -> None:
+    """End all processes. In an interrupted run the workers end first, while the learner still answers."""
     workers = [name for name in supervisor.children if name != LEARNER]
     patience_s = max(role.grace_s for role in ROLES if role.name != "learner")
-    if stop.is_set():
+    if workers_first:
         supervisor.stop(workers, patience_s)
     supervisor.stop([LEARNER], role_named("learner").grace_s)
     supervisor.stop(workers, patience_s)
@@ -168,10 +168,10 @@ def run_prepared(run: PreparedRun, stop: Event, prog: str) -> int:
             with closing(transport):
                 watcher = Watcher(view, transport)
                 watch(run, view, transport, watcher, supervisor, stop)
-                end(supervisor, stop)
+                end(supervisor, stop.is_set())
                 watcher.look(time.monotonic())  # the learner's last heartbeat
     finally:
-        end(supervisor, stop)
+        end(supervisor, stop.is_set())
     return conclude(run, supervisor, view.statuses.get(("learner", "0")), stop, prog)
 
 

@@ -2,10 +2,12 @@
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from common.evaluation.breakdown import BREAKDOWNS
+
+Lines = Callable[[Mapping[str, Any]], Sequence[str]]
 
 RATES: Final = (
     ("caught", "catch_rate"),
@@ -15,12 +17,21 @@ RATES: Final = (
 )
 
 
-def print_measures(found: Mapping[str, Any], as_json: bool) -> None:
-    """Print measures for a person, or as one JSON line."""
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-        return
-    sys.stdout.write("\n".join([*aligned(summary(found)), *table(found["by"])]) + "\n")
+def evaluation_lines(found: Mapping[str, Any]) -> list[str]:
+    """Return what ``measure`` found as lines for people."""
+    return [*aligned(summary(found)), *table(found["by"])]
+
+
+def print_measures(found: Mapping[str, Any], as_json: bool, lines: Lines = evaluation_lines) -> None:
+    """Print measures for a person, or as one JSON line.
+
+    Args:
+        found: What ``measure`` found, or what ``lines`` reads.
+        as_json: Whether a program reads it.
+        lines: Returns the lines for people.
+    """
+    shown = [json.dumps(found)] if as_json else lines(found)
+    sys.stdout.write("\n".join(shown) + "\n")
 
 
 def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -108,12 +108,12 @@ def read_sources(
     """Return the values from flags, environment and files; and whether ``--print-config`` is among the flags."""
     environ = os.environ if environ is None else environ
     prints = PRINT in argv
-    flags, file = _read_flags([word for word in argv if word != PRINT], program)
+    flags = _read_flags([word for word in argv if word != PRINT], program)
     environment = _read_environment(environ, program)
-    if file:
-        _check_use(file, program)
+    if file := named_file(argv, {}):
+        _check_use(str(file), program)
     elif recorded is None:
-        file = environ.get(f"{ENVIRONMENT_PREFIX}CONFIG", "")
+        file = named_file((), environ)
     files = [str(one) for one in (file, recorded, beneath) if one]
     return (flags, environment, *(read_file(one, program) for one in files)), prints
 
@@ -128,10 +128,10 @@ def named_file(argv: Sequence[str], environ: Mapping[str, str]) -> Path | None:
     return Path(found) if found else None
 
 
-def _read_flags(argv: Sequence[str], program: Program) -> tuple[Layer, str]:
-    """Return the values of the flags, and the file that they name."""
+def _read_flags(argv: Sequence[str], program: Program) -> Layer:
+    """Return the values of the flags, without the file that they name."""
     settings = program.settings
-    layer, file = Layer(), ""
+    layer = Layer()
     words = list(argv)
     while words:
         word = words.pop(0)
@@ -150,11 +150,9 @@ def _read_flags(argv: Sequence[str], program: Program) -> tuple[Layer, str]:
             if not is_switch and (not words or words[0].startswith("--")):
                 raise ConfigError(f"--{name} needs a value")
             value = "true" if is_switch else words.pop(0)
-        if setting is None:
-            file = value
-        else:
+        if setting is not None:
             layer.put(path, setting.parse(value), f"--{name}")
-    return layer, file
+    return layer
 
 
 def _help(program: Program, every: bool) -> str:

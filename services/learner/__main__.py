@@ -49,14 +49,14 @@ def main(stop: Event) -> int:
     """
     if os.environ.get("RANK", "0") != "0":
         return follow(stop)
-    config = settings(sys.argv[1:])
+    config, file = settings(sys.argv[1:]), named_file(sys.argv[1:], os.environ)
     from services.learner.group import ALONE, join
 
     if "WORLD_SIZE" not in os.environ:
-        return lead(config, ALONE, stop, named_file(sys.argv[1:], os.environ))
+        return lead(config, ALONE, stop, file)
     group = join()
     try:
-        return lead(config, group, stop, named_file(sys.argv[1:], os.environ))
+        return lead(config, group, stop, file)
     finally:
         group.leave()
 

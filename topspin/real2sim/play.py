@@ -14,6 +14,7 @@ from common.evaluation.breakdown import breakdown
 from common.evaluation.evaluate import check
 from common.evaluation.match import match_task, play_match
 from common.evaluation.measures import MatchResult, measures
+from common.evaluation.printed import print_measures
 from common.evaluation.rally_recorder import RecordedRally, record_rallies
 from common.policy.box import policy_folder
 from common.policy.contract import Contract
@@ -23,7 +24,7 @@ from common.task.config import TaskConfig
 from topspin.real2sim.config import Real2SimConfig
 from topspin.real2sim.dataset import Recorded, evenly, read
 from topspin.real2sim.formats.tracks import RecordingError
-from topspin.real2sim.printed import print_found
+from topspin.real2sim.printed import lines
 from topspin.render.film import check_tools, film
 
 log = logging.getLogger(__name__)
@@ -51,7 +52,7 @@ def run(config: Real2SimConfig, stop: Event) -> int:
         block = recorded.rallies.block()
     except RecordingError:
         if config.json_line:
-            print_found(without_rallies(recorded, config), as_json=True)
+            print_measures(without_rallies(recorded, config), as_json=True)
         raise
     opponents = recorded.opponents(task.observation.is_tracked and task.observation.expected_spin == "learnt")
     log.info("playing rallies=%d of=%d mode=%s", len(block.seeds), len(recorded.tracks), config.mode)
@@ -79,7 +80,7 @@ def run(config: Real2SimConfig, stop: Event) -> int:
     if page is not None:
         found["report"] = str(Path(config.out) / "report.md")
         page.write(found, played, recorded, {k: again[k] for k in shown.tolist()}, Path(config.out))
-    print_found(found, config.json_line)
+    print_measures(found, config.json_line, lines)
     return DONE
 
 

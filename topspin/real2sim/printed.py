@@ -1,20 +1,15 @@
 """The measures of recorded balls as lines for people."""
 
-import json
-import sys
 from collections.abc import Mapping
 from typing import Any
 
 from common.evaluation.printed import aligned, results, table
 
 
-def print_found(found: Mapping[str, Any], as_json: bool) -> None:
-    """Print measures for a person, or as one JSON line."""
-    if as_json:
-        sys.stdout.write(json.dumps(found) + "\n")
-        return
+def lines(found: Mapping[str, Any]) -> list[str]:
+    """Return what was measured on recordings as lines for people."""
     by = {name: found[f"by_{name}"] for name in ("speed", "spin", "spin_kind")}
-    sys.stdout.write("\n".join([*aligned(summary(found)), *table(by)]) + "\n")
+    return [*aligned(summary(found)), *table(by)]
 
 
 def summary(found: Mapping[str, Any]) -> list[tuple[str, str]]:

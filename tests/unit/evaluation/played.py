@@ -6,6 +6,18 @@ from common.evaluation.measures import MatchResult
 from common.task.states import Outcome
 
 NAN = float("nan")
+RATES_AND_ERRORS = {
+    "over_rate": 0.9,
+    "over_rate_ci": [0.886, 0.912],
+    "return_rate": 0.8175,
+    "return_rate_ci": [0.8, 0.8338],
+    "target_error_mean": 0.2812,
+    "target_error_mean_ci": [0.2731, 0.2893],
+    "target_error_median": 0.2488,
+    "within_0.2_m": 0.38,
+    "within_0.3_m": 0.611,
+}
+"""Some measures of a match, as JSON has them."""
 
 
 def make_played(rows, **columns):

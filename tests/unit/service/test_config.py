@@ -325,14 +325,18 @@ def test_shared_settings_and_tables_have_names_of_their_own():
     assert not set(SHARED) & set(TABLES)
 
 
+def lag_and_stage(argv, environ, **files):
+    settings = load(Learner, argv, prog="p", section="learner", environ=environ, **files)
+    return settings.max_lag, settings.stage
+
+
 def test_flags_variables_and_a_named_file_override_recorded_settings(toml, tmp_path):
     recorded = tmp_path / "recorded.toml"
     save_settings(recorded, {"learner": {"max_lag": 3, "stage": 3}})
     named = toml("[learner]\nmax_lag = 4")
 
     def found(*argv, **environ):
-        settings = load(Learner, argv, prog="p", section="learner", environ=environ, recorded=recorded)
-        return settings.max_lag, settings.stage
+        return lag_and_stage(argv, environ, recorded=recorded)
 
     assert found() == found(TOPSPIN_CONFIG=named) == (3, 3)
     assert found("--max-lag", "5") == found(TOPSPIN_LEARNER__MAX_LAG="5") == (5, 3)
@@ -358,8 +362,7 @@ def test_settings_beneath_count_where_nothing_else_gives_a_value(toml, tmp_path)
     named = toml("[learner]\nmax_lag = 4")
 
     def found(*argv, **environ):
-        settings = load(Learner, argv, prog="p", section="learner", environ=environ, beneath=beneath)
-        return settings.max_lag, settings.stage
+        return lag_and_stage(argv, environ, beneath=beneath)
 
     assert found() == (3, 3)
     assert found("--config", named) == found(TOPSPIN_CONFIG=named) == (4, 3)

@@ -1,8 +1,9 @@
 """What a person reads of recorded balls."""
 
+from tests.unit.evaluation.played import RATES_AND_ERRORS
 from topspin.real2sim.printed import summary
 
-FOUND = {
+FOUND = RATES_AND_ERRORS | {
     "policy": "runs/night/policy/best",
     "expected_spin": "mild",
     "opponents": 38,
@@ -18,17 +19,8 @@ FOUND = {
     "rallies": 1351,
     "catch_rate": 1.0,
     "catch_rate_ci": [0.9966, 1.0],
-    "over_rate": 0.9,
-    "over_rate_ci": [0.886, 0.912],
-    "return_rate": 0.8175,
-    "return_rate_ci": [0.8, 0.8338],
     "return_after_catch": 0.8175,
     "return_after_catch_ci": [0.8, 0.8338],
-    "target_error_mean": 0.2812,
-    "target_error_mean_ci": [0.2731, 0.2893],
-    "target_error_median": 0.2488,
-    "within_0.2_m": 0.38,
-    "within_0.3_m": 0.611,
     "outcomes": {"returned": 1105, "net": 246},
     "seconds": 12.34,
 }
