@@ -76,7 +76,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
         rallies = evaluation_rallies(config.film_rallies, task, config.seed)
         note = f"{config.launch} balls, randomization {config.randomization}"
         # played once more, from home: a match keeps no flights
-        records = record_rallies(policy.act, rallies, task)
+        records = record_rallies(policy.act, rallies, task, on_tick)
         film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
     found["seconds"] = round(time.monotonic() - started, 2)
     if config.json_line or not config.film_rallies:

@@ -12,6 +12,7 @@ from typing import Final
 
 KIB: Final = 1024
 MIB: Final = 1024 * KIB
+LARGEST: Final = 64 * MIB  # [bytes] of any message
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +27,8 @@ CONTROL: Final = Budget(64 * KIB, 4096)
 
 BUDGETS: Final[Mapping[str, Budget]] = MappingProxyType(
     {
-        "Rollout": Budget(64 * MIB, 4096),
-        "PolicySnapshot": Budget(64 * MIB, 256),
+        "Rollout": Budget(LARGEST, 4096),
+        "PolicySnapshot": Budget(LARGEST, 256),
         "RallyBatch": Budget(4 * MIB, 256),
         "RallyRequest": CONTROL,
         "StageChange": CONTROL,

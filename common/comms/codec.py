@@ -25,11 +25,10 @@ from typing import Any, Final, TypeVar
 import msgpack
 import numpy as np
 
-from common.comms.budgets import LONGEST_TEXT, budget_of, items_in, one_line
+from common.comms.budgets import LARGEST, LONGEST_TEXT, budget_of, items_in, one_line
 from common.comms.wire import Dims, Message, Wire, slots_of
 
 MAGIC: Final = b"TSPN"
-DEFAULT_LIMIT_BYTES: Final = 64 * 1024 * 1024
 
 _HEADER: Final = struct.Struct("<4sII")
 _MAX_ITEMS: Final = 65_536  # of one msgpack array or map; arrays of numbers travel as bytes
@@ -57,7 +56,7 @@ def encode(message: Message) -> bytes:
     return _HEADER.pack(MAGIC, zlib.crc32(body), len(body)) + body
 
 
-def decode(payload: bytes, expected: type[_M], *, limit_bytes: int = DEFAULT_LIMIT_BYTES) -> _M:
+def decode(payload: bytes, expected: type[_M], *, limit_bytes: int = LARGEST) -> _M:
     """Return the checked message in ``payload``. For any bytes it raises DecodeError or nothing."""
     name, budget = expected.__name__, budget_of(expected.__name__)
     if len(payload) > (allowed := min(limit_bytes, budget.bytes)):

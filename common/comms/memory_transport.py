@@ -11,11 +11,11 @@ from functools import partial
 from threading import RLock
 from typing import TypeVar
 
+from common.comms.budgets import LARGEST
 from common.comms.keys import matches
 from common.comms.mailbox import Bell, Mailbox
 from common.comms.transport import (
     MAX_ALIVE_EVENTS,
-    MAX_MESSAGE_BYTES,
     AliveEvent,
     AliveWatch,
     Flow,
@@ -93,7 +93,7 @@ class MemoryBroker:
         self._declared: list[_Declared] = []
         self._queries: list[_Query] = []
 
-    def open(self, *, hub: bool = False, max_message_bytes: int = MAX_MESSAGE_BYTES) -> "MemoryTransport":
+    def open(self, *, hub: bool = False, max_message_bytes: int = LARGEST) -> "MemoryTransport":
         """Return a new transport. Raises TransportError for a second hub, or a client without a hub."""
         with self._lock:
             if hub and self._hub is not None:

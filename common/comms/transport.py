@@ -21,7 +21,6 @@ from typing import Any, Final, Protocol
 from common.comms.mailbox import Bell, Mailbox
 from common.errors import ReportedError
 
-MAX_MESSAGE_BYTES = 64 * 1024 * 1024  # memory of one message at the receiver
 MAX_ALIVE_EVENTS = 65536  # many more than any fleet has members: an alive event must not be dropped
 
 

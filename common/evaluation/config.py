@@ -28,10 +28,15 @@ MatchSpin = Annotated[
 ]
 
 
-class MatchConfig(MatchConditions):
-    """A match: fixed rallies, and the conditions of play."""
+class RalliesConfig(MatchConditions):
+    """Fixed rallies, and the conditions under which they are played."""
 
     rallies: int = Field(2000, ge=1, le=1_000_000, description="rallies to play")
     seed: int = Field(SEED, ge=0, lt=2**63, description="seed of the rallies")
-    envs: Environments = DEFAULT_ENVS
     expected_spin: MatchSpin = "contract"
+
+
+class MatchConfig(RalliesConfig):
+    """A match: fixed rallies, played in environments that share them."""
+
+    envs: Environments = DEFAULT_ENVS

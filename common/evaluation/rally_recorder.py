@@ -93,13 +93,16 @@ class _Moment:
     tracked: Array  # (B, ESTIMATE_SIZE - 1), or no rows
 
 
-def record_rallies(act: Act, rallies: RallyBlock, task: TaskConfig) -> list[RecordedRally]:
+def record_rallies(
+    act: Act, rallies: RallyBlock, task: TaskConfig, on_tick: Callable[[], None] = lambda: None
+) -> list[RecordedRally]:
     """Return the records of ``rallies``, each played once by a robot that starts near home.
 
     Args:
         act: Actions (B, 7) for observations (B, D).
         rallies: The n rallies to play, in n environments.
         task: The task. A ball that has landed is recorded until its next touch.
+        on_tick: Called after each control step.
     """
     count = len(rallies.seeds)
     dealer = _Dealer(rallies)
@@ -114,6 +117,7 @@ def record_rallies(act: Act, rallies: RallyBlock, task: TaskConfig) -> list[Reco
     while len(found) < count:
         at_the_end.clear()
         step = env.step(act(obs))
+        on_tick()
         obs = step.obs
         moments.append(at_the_end[0] if at_the_end else _moment(env))
         over = step.finished

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from common.policy.actor_critic import ActorCritic, log_prob
 from common.policy.losses import LossWeights
 from common.policy.network_pass import DTYPES, Precision
-from services.learner.engine import MakeOptimizer, Plan, StepSums
+from services.learner.engine import MakeOptimizer, Plan, StepSums, kl_sum
 from services.learner.minibatches import Dataset
 
 Array = npt.NDArray[np.float64]
@@ -101,7 +101,7 @@ class DeviceEngine:
         self.optimizer.found_inf = (~is_finite).float()  # type: ignore[attr-defined]  # read by fused optimisers
         self.optimizer.step()
         if len(batch):
-            sums[0] = divergence_sum(batch, moved, self._copy.log_std.detach())
+            sums[0] = kl_sum(batch, moved, self._copy.log_std.detach())
         sums /= count
         sums[-2] = norm
         sums[-1:] = 1.0  # not sums[-1]: a number that is copied there would be waited for
@@ -151,10 +151,3 @@ def losses(
     loss = loss / count - plan.entropy_weight * log_std.sum() * (len(batch.actions) / count)
     found = torch.stack([of.detach().double() for of in (policy, value, bound, correction, outside)])
     return loss, found, (mean.detach() - batch.mean_prox).double().square().sum(0)
-
-
-def divergence_sum(batch: Dataset, moved: Tensor, log_std: Tensor) -> Tensor:
-    """Return the sum over a minibatch of KL(prox, new): ``services.learner.engine.kl_sum`` on the device."""
-    old, new, rows = batch.log_std_prox.double(), log_std.double(), len(batch)
-    spread = (rows * torch.exp(2.0 * old) + moved) / (2.0 * torch.exp(2.0 * new))
-    return (rows * (new - old - 0.5) + spread).sum()

@@ -137,7 +137,7 @@ class CpuEngine:
         self.optimizer.step()
         self._pass.refresh()
         if len(batch):
-            sums[0] = kl_sum(batch, self._moved, self._log_std)
+            sums[0] = float(kl_sum(batch, torch.from_numpy(self._moved), self._log_std))
         sums[:OF_FRAMES] /= count
         sums[OF_FRAMES:] = norm, 1.0
         return sums
@@ -166,17 +166,17 @@ class CpuEngine:
         """End an update: nothing is left to do."""
 
 
-def kl_sum(batch: Dataset, moved: Array, log_std: Tensor) -> float:
-    """Return the sum over a minibatch of KL(prox, new).
+def kl_sum(batch: Dataset, moved: Tensor, log_std: Tensor) -> Tensor:
+    """Return the sum over a minibatch of KL(prox, new), on its device.
 
     Args:
         batch: Its frames.
-        moved: Sum over the frames of the squared changes of the mean action (A,).
+        moved: Sum over the frames of the squared changes of the mean action (A,), float64.
         log_std: Of the new policy (A,).
     """
-    old, new = (values.double().numpy() for values in (batch.log_std_prox, log_std))
-    spread = (len(batch) * np.exp(2.0 * old) + moved) / (2.0 * np.exp(2.0 * new))
-    return float((len(batch) * (new - old - 0.5) + spread).sum())
+    old, new, rows = batch.log_std_prox.double(), log_std.double(), len(batch)
+    spread = (rows * torch.exp(2.0 * old) + moved) / (2.0 * torch.exp(2.0 * new))
+    return (rows * (new - old - 0.5) + spread).sum()
 
 
 def limit_norm(gradient: Tensor, longest: float) -> float:

@@ -7,7 +7,7 @@ from common.errors import ConfigError, StoppedError
 from common.policy.folder import save_policy
 from common.service.config import load
 from tests.unit.evaluation.test_match import make_policy
-from topspin import evaluate, play, progress
+from topspin import evaluate, pictures, play, progress
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
 from topspin.render import film as film_module
@@ -77,6 +77,20 @@ def test_play_stops_on_request(folder):
 
     with pytest.raises(StoppedError, match="stopped before it was done"):
         play.main(["--policy", str(folder), "--film-rallies", "0"], stop)
+
+
+def test_pictures_stop_on_request(folder, tmp_path):
+    stop = Event()
+    stop.set()
+
+    with pytest.raises(StoppedError, match="stopped before it was done"):
+        pictures.main(["--policy", str(folder), "--out", str(tmp_path), "--rallies", "2"], stop)
+
+
+@pytest.mark.parametrize("flags", [["--rounds", "5"], ["--envs", "5"]])
+def test_pictures_refuse_what_has_no_effect_on_them(flags):
+    with pytest.raises(ConfigError):
+        load(PicturesConfig, flags, prog="topspin pictures", section="pictures")
 
 
 @pytest.mark.parametrize(

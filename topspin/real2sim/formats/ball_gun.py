@@ -27,6 +27,7 @@ BOUNCE_HEIGHT: Final = 0.759  # m; of the ball's centre, in the files' frame
 FRAME: Final = Frame(
     rotation_of(("-x", "-y", "z")), np.array([TABLE_HALF_LENGTH, 0.0, BOUNCE_HEIGHT - BALL_RADIUS])
 )
+KEYS: Final = ("label", "player")  # of a sidecar
 LABELS: Final = ("topspin", "backspin", "no_spin", "sidespin")
 _GROUP: Final = "originals"
 
@@ -37,7 +38,7 @@ def read_hdf5(path: Path) -> Recordings:
         import h5py  # noqa: PLC0415 - an extra that other formats do not need
     except ImportError:
         raise RecordingError(f"{path}: HDF5 needs h5py: pip install -e '.[real2sim]'") from None
-    given = read_frame(path)
+    given = read_frame(path, KEYS)
     label = given.label or next((known for known in LABELS if known in path.stem), "")
     dropped: Counter[str] = Counter()
     tracks: list[Track] = []

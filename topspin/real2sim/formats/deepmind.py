@@ -17,6 +17,7 @@ from topspin.real2sim.formats.frames import Frame, read_frame, rotation_of
 from topspin.real2sim.formats.tracks import RecordingError, Recordings, States, checked_states
 
 FRAME: Final = Frame(rotation_of(("y", "-x", "z")), np.zeros(3))
+KEYS: Final = ("label", "player", "velocity_delay_s")  # of a sidecar
 COLUMNS: Final = tuple(f"{what}_{axis}" for what in ("pos", "vel", "w_vel") for axis in "xyz")
 
 
@@ -36,7 +37,7 @@ def read_json(path: Path, turn: bool) -> Recordings:
         [FRAME.positions(rows[:, :3]), FRAME.velocities(rows[:, 3:6]), FRAME.spins(rows[:, 6:9])]
     )
     dropped: Counter[str] = Counter()
-    given = read_frame(path)
+    given = read_frame(path, KEYS)
     players = [given.player if (own := entry.get("player")) is None else str(own) for entry in entries]
     labels = [given.label or path.stem] * len(ids)
     states: States = checked_states(ids, world, labels, dropped, turn, players, given.velocity_delay)

@@ -123,8 +123,16 @@ def sidecar_of(path: Path) -> Path:
     return shared if shared.is_file() and not own.is_file() else own
 
 
-def read_frame(path: Path) -> Frame:
-    """Return the frame of the recording at ``path`` by its TOML file or its folder's; the world's without one."""
+def read_frame(path: Path, used: tuple[str, ...] = KEYS) -> Frame:
+    """Return the frame of the recording at ``path`` by its TOML file or its folder's; the world's without one.
+
+    Args:
+        path: Of the recording.
+        used: Keys that have an effect on it. A folder's file may have others: they are for other recordings.
+
+    Raises:
+        RecordingError: The TOML file is at fault, or is the recording's own and has a key without effect.
+    """
     sidecar = sidecar_of(path)
     if not sidecar.is_file():
         return world_frame()
@@ -132,7 +140,14 @@ def read_frame(path: Path) -> Frame:
         table = tomllib.loads(sidecar.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:  # not TOML, no text, or beyond Python's limits
         raise RecordingError(f"{sidecar}: not readable as TOML: {error}") from None
-    return _frame(table, sidecar)
+    frame = _frame(table, sidecar)
+    idle = [key for key in table if key not in used]
+    if idle and sidecar.name != FOLDER_SIDECAR:
+        raise RecordingError(
+            f"{sidecar}: {idle[0]} has no effect on a {path.suffix} file, whose frame is known; "
+            f"allowed: {', '.join(used)}"
+        )
+    return frame
 
 
 def _frame(table: dict[str, Any], sidecar: Path) -> Frame:

@@ -552,6 +552,22 @@ def test_a_player_of_json_that_is_null_is_the_sidecars(tmp_path):
     assert load(path).states.players == ("somebody", "Anna")
 
 
+def test_a_sidecars_key_without_effect_is_refused_unless_it_is_the_folders(tmp_path):
+    states = write_json(tmp_path / "rallies.json", STATE)
+    gun = write_hdf5(tmp_path / "gun.hdf5", **{"7": (TRACK.times, TRACK.positions)})
+    for path in (states, gun):
+        path.with_suffix(".toml").write_text('label = "drive"\nlength_unit = "mm"\n')
+
+        with pytest.raises(
+            RecordingError, match=rf"length_unit has no effect on a {path.suffix} file.*allowed: label"
+        ):
+            load(path)
+
+        path.with_suffix(".toml").rename(tmp_path / "folder.toml")
+        assert (load(path).states.labels or [track.label for track in load(path).tracks])[0] == "drive"
+        (tmp_path / "folder.toml").unlink()
+
+
 def test_a_field_of_text_without_an_end_is_one_line(tmp_path):
     path = tmp_path / "long.csv"
     path.write_text("t;x;y;z\n" + "1" * 200_000 + ";1;2;3\n")
