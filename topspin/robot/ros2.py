@@ -17,6 +17,7 @@ import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -177,19 +178,21 @@ def main(argv: Sequence[str]) -> int:
     arguments = parser.parse_args(argv)
     names = [name for name in arguments.joint_names.split(",") if name]
     try:
-        _spin(load(arguments.folder), arguments.frame, names)
+        spin(load(arguments.folder), arguments.frame, names)
     except ReportedError as error:
         sys.stderr.write(f"{parser.prog}: {error}\n")
         return 1
     return 0
 
 
-def _spin(controller: Controller, frame: str, names: Sequence[str]) -> None:
+def spin(controller: Controller, frame: str, names: Sequence[str]) -> None:
+    """Run the node until a signal ends it. Raises ReportedError without ROS 2."""
     # rclpy is no package of an index: it comes with ROS 2
     try:
         import rclpy  # noqa: PLC0415
         from builtin_interfaces.msg import Duration, Time  # noqa: PLC0415
         from geometry_msgs.msg import PointStamped  # noqa: PLC0415
+        from rclpy.executors import ExternalShutdownException  # noqa: PLC0415
         from sensor_msgs.msg import JointState  # noqa: PLC0415
         from std_msgs.msg import Header  # noqa: PLC0415
         from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: PLC0415
@@ -204,7 +207,11 @@ def _spin(controller: Controller, frame: str, names: Sequence[str]) -> None:
     ros.create_subscription(PointStamped, NEW_BALL, node.on_new_ball, 10)
     ros.create_subscription(JointState, JOINTS, node.on_joints, 1)
     ros.create_timer(controller.contract.period, lambda: node.on_timer(ros.get_clock().now().to_msg()))
-    rclpy.spin(ros)
+    # Ctrl-C, or the launch system's signal: the usual end of a node, and no fault
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(ros)
+    ros.destroy_node()
+    rclpy.try_shutdown()
 
 
 if __name__ == "__main__":

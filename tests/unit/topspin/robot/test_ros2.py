@@ -1,5 +1,8 @@
 """The ROS 2 node without ROS: its messages are written and read as ROS 2 does, by its own definitions."""
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
@@ -11,7 +14,7 @@ from topspin.robot.controller import MAX_HELD, Controller
 from topspin.robot.faults import Fault
 from topspin.robot.made_up_ball import detections
 from topspin.robot.network import Network
-from topspin.robot.ros2 import Messages, RobotNode
+from topspin.robot.ros2 import Messages, RobotNode, spin
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = {
@@ -173,3 +176,41 @@ def test_a_robot_with_its_own_names_of_the_joints(controller):
     assert [message.joint_names for message in sent] == [names]
     with pytest.raises(ReportedError, match="1 joint names; allowed: 7, for rail_x"):
         RobotNode(controller, MESSAGES, sent.append, joint_names=["one"])
+
+
+class ShutDownError(Exception):
+    """What rclpy's executor raises when a signal has ended its context."""
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, ShutDownError])
+def test_a_signal_ends_the_node_without_a_traceback(controller, monkeypatch, end):
+    """rclpy itself is not here: what it is asked for is."""
+    closed = []
+
+    def spinning(_node):
+        raise end
+
+    node = SimpleNamespace(
+        create_publisher=lambda *_: SimpleNamespace(publish=None),
+        create_subscription=lambda *_: None,
+        create_timer=lambda *_: None,
+        destroy_node=lambda: closed.append("node"),
+    )
+    rclpy = SimpleNamespace(
+        init=lambda: None,
+        create_node=lambda _: node,
+        spin=spinning,
+        try_shutdown=lambda: closed.append("context"),
+    )
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+    monkeypatch.setitem(
+        sys.modules, "rclpy.executors", SimpleNamespace(ExternalShutdownException=ShutDownError)
+    )
+    for module in ("builtin_interfaces", "geometry_msgs", "sensor_msgs", "std_msgs", "trajectory_msgs"):
+        types = SimpleNamespace(**TYPES)
+        monkeypatch.setitem(sys.modules, module, SimpleNamespace(msg=types))
+        monkeypatch.setitem(sys.modules, f"{module}.msg", types)
+
+    spin(controller, "table", [])
+
+    assert closed == ["node", "context"]
