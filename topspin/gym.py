@@ -46,6 +46,7 @@ def _box(layout: tuple[Part, ...]) -> spaces.Box:
 
 
 ACTION_SPACE = _box(ACTION)
+OF_BATCH: Final = ("threads", "autoreset_mode")
 DEFAULTS: Final[Mapping[str, Any]] = {
     "observation": PAPER_OBSERVATION,
     "end_at_hit_share": 0.0,
@@ -67,10 +68,14 @@ def _of_settings(model: type[_Model], given: dict[str, Any]) -> _Model:
             for parent in parents:
                 inner = cast(type[BaseModel], inner.model_fields[parent].annotation)
             known = tuple(inner.model_fields) if parents else (*TaskConfig.model_fields, *_EPISODES)
-            nearest = difflib.get_close_matches(unknown, known, n=1, cutoff=0.5)
+            if unknown in OF_BATCH:
+                raise ValueError(f"{name!r} is an argument of make_vec alone") from None
+            nearest = difflib.get_close_matches(unknown, known, n=1, cutoff=0.7)
             hint = f"did you mean {nearest[0]!r}?" if nearest else f"allowed: {', '.join(known)}"
             raise ValueError(f"unknown setting {name!r}; {hint}") from None
-        raise ValueError(f"{name or 'settings'} = {first['input']!r}; {first['msg']}") from None
+        if not name:  # settings that do not fit each other
+            raise ValueError(first["msg"].removeprefix("Value error, ")) from None
+        raise ValueError(f"{name} = {first['input']!r}; {first['msg']}") from None
 
 
 def check_choices(render_mode: str | None, modes: list[str], stage: int) -> None:
@@ -191,7 +196,7 @@ class RallyGymEnv(gymnasium.Env[Any, Any]):
         if seed is not None or self._batch.env is None:
             obs = self._batch.begin(fresh_seed(self.np_random))
         elif self._next_obs is None:  # in the middle of an episode
-            obs = self._batch.env.reset()
+            obs = self._batch.env.reset(keeps_opponents=True)
         else:
             obs = self._next_obs
         self._next_obs = None

@@ -11,6 +11,7 @@ from typing import ClassVar, Final
 
 from pydantic import Field
 
+from common.errors import ReportedError
 from common.evaluation.config import MatchConfig
 from common.service.config import load
 from common.service.log import set_up_logging
@@ -61,7 +62,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     folder = policy_folder(config.policy)
     policy = load_policy(folder)
     if config.film_rallies:
-        check_tools()
+        check_tools(Path(config.video))
 
     def on_tick() -> None:
         check(stop)
@@ -77,7 +78,14 @@ def main(argv: Sequence[str], stop: Event) -> int:
         note = f"{config.launch} balls, randomization {config.randomization}"
         # played once more, from home: a match keeps no flights
         records = record_rallies(policy.act, rallies, task, on_tick)
-        film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
+        try:
+            film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
+        except ReportedError:
+            if config.json_line:  # the measures are there, if no film is
+                print_measures(
+                    {name: value for name, value in found.items() if name != "video"}, as_json=True
+                )
+            raise
     found["seconds"] = round(time.monotonic() - started, 2)
     if config.json_line or not config.film_rallies:
         print_measures(found, config.json_line)

@@ -222,17 +222,18 @@ class RallyEnv:
         """The robots' motion in the last control step."""
         return self._contacts.motion
 
-    def reset(self, rows: Rows | None = None) -> Floats:
-        """Start environments again, robots at home and opponents unknown; return all observations (B, D).
+    def reset(self, rows: Rows | None = None, keeps_opponents: bool = False) -> Floats:
+        """Start environments again, robots at home; return all observations (B, D).
 
         Args:
             rows: Which; the others go on. None: all of them.
+            keeps_opponents: Whether what is known of their opponents' spin stays.
         """
         if rows is None or not self._started:
             rows = self._all
         self._started = False
         self._waiting = np.setdiff1d(self._waiting, rows)
-        if len(self._rallies.track):
+        if len(self._rallies.track) and not keeps_opponents:
             self._rallies.track[rows] = self._new_tracks()[rows]
         self.robot.go_home(rows, np.zeros((rows.size, ACTION_SIZE)))
         self._rallies.last_action[rows] = self.robot.home_action

@@ -124,7 +124,12 @@ def chain_of(name: str) -> Chain:
     is_hinge = model.jnt_type[:JOINTS] == mujoco.mjtJoint.mjJNT_HINGE.value
     anchors = np.array(data.xanchor[:JOINTS])
     before = np.vstack([np.zeros(3), anchors[:-1]])
-    geom, site = model.geom(robot.racket).id, model.site(robot.racket).id
+    try:
+        geom, site = model.geom(robot.racket).id, model.site(robot.racket).id
+    except KeyError:
+        raise RobotError(
+            f"robot {name}: racket {robot.racket!r}; allowed: the name of a geom and of a site in its model"
+        ) from None
     if (
         model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_CYLINDER
         or owner[model.geom_bodyid[geom]] != JOINTS - 1

@@ -141,7 +141,12 @@ def robot_xml(name: str) -> str:
         RobotError: The robot's files are missing or don't fit together.
     """
     robot, path = describe(name), model_path(name)
-    root = ET.fromstring(path.read_text())
+    try:
+        root = ET.fromstring(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RobotError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
+    except ET.ParseError as error:
+        raise RobotError(f"{path}: not readable as XML: {error}") from None
     world = root.find("worldbody")
     if world is None:
         raise RobotError(f"{path}: no worldbody")

@@ -54,7 +54,7 @@ SHARED: Final = (
 
 
 PRINT: Final = "--print-config"
-_BOOLEANS: Final = ("true", "false", "yes", "no", "on", "off", "1", "0")
+BOOLEANS: Final = ("true", "false", "yes", "no", "on", "off", "1", "0")
 
 
 @dataclass(slots=True)
@@ -146,7 +146,7 @@ def _read_flags(argv: Sequence[str], program: Program) -> Layer:
             flags = [f"--{flag_of(known)}" for known in settings]
             raise ConfigError(f"unknown flag --{name}{_suggestion(f'--{name}', flags)}")
         if not equals:
-            is_switch = setting is not None and setting.is_switch and not (words and words[0] in _BOOLEANS)
+            is_switch = setting is not None and setting.is_switch and not (words and words[0] in BOOLEANS)
             if not is_switch and (not words or words[0].startswith("--")):
                 raise ConfigError(f"--{name} needs a value")
             value = "true" if is_switch else words.pop(0)

@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import RecordVideo
 
+from common.perception.flight_track import POSTERIOR_MILD
 from common.task.config import TaskConfig
 from common.task.observation import PAPER_OBSERVATION, ObservationConfig, policy_layout, size
 from common.task.states import Outcome
@@ -177,6 +178,36 @@ def test_the_simulators_truth_is_in_no_observation(observation):
     assert envs.observation_space.shape == envs.reset(seed=1)[0].shape == (4, seen)
 
 
+def test_an_argument_of_the_batch_alone_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"^'threads' is an argument of make_vec alone$"):
+        RallyGymEnv(threads=2)
+
+
+def test_a_reset_in_the_middle_of_an_episode_keeps_what_is_known_of_the_opponent():
+    """Strong balls show a strong opponent, whom a reset without a seed does not change."""
+    observation = ObservationConfig(expected_spin="learnt")
+    env = RallyGymEnv(launch="strong", observation=observation, carry_over=0.0)
+    env.reset(seed=0)
+    ends = 0
+    while ends < 6:
+        *_, terminated, truncated, _ = env.step(np.zeros(7, np.float32))
+        if terminated or truncated:
+            env.reset()
+            ends += 1
+
+    def is_mild():
+        return env._batch.started.rallies.track[0, POSTERIOR_MILD]
+
+    learnt = is_mild()
+    env.step(np.zeros(7, np.float32))
+    env.reset()
+
+    assert learnt < 0.01
+    assert is_mild() == learnt
+    env.reset(seed=0)
+    assert is_mild() > 0.5
+
+
 def test_an_unknown_setting_is_refused():
     with pytest.raises(ValueError, match="noize"):
         make(noize="off")
@@ -188,6 +219,7 @@ def test_an_unknown_setting_is_refused():
     [
         ({"launch": "wild"}, "launch = 'wild'; Input should be 'paper', 'strong'"),
         ({"launsh": "paper"}, "unknown setting 'launsh'; did you mean 'launch'"),
+        ({"collision": "original", "rubber": "anti_spin"}, "^rubber anti_spin with"),
         ({"stage": 4}, "stage 4; allowed: 1, 2, 3"),
         ({"stage": 3.0}, "stage 3.0; allowed: 1, 2, 3"),
         ({"observation": {"hist": 3}}, "unknown setting 'observation.hist'; did you mean 'history'"),

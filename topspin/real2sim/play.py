@@ -42,7 +42,7 @@ def run(config: Real2SimConfig, stop: Event) -> int:
     video = video_of(config)
     page = _page() if config.out else None  # raises before anything is played if a library is missing
     if video is not None:
-        check_tools()
+        check_tools(video)
     folder = policy_folder(config.policy)
     policy = load_policy(folder)
     task = task_of(policy.contract, config)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, Final
 
 import numpy as np
@@ -46,8 +47,14 @@ class FilmOptions:
     note: str = ""  # written on every picture
 
 
-def check_tools() -> None:
-    """Raise RenderError if this machine can't make a film; called before the rallies are played."""
+def check_tools(path: Path) -> None:
+    """Raise RenderError if no film can be made here, or none at ``path``; called before the rallies are played."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise RenderError(f"can't write {path}: {error.strerror}") from None
     for module in ("imageio_ffmpeg", "PIL.Image"):
         wanted(module)
     with Painter(64, 64):

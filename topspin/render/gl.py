@@ -16,7 +16,7 @@ from common.errors import ReportedError
 
 Image = npt.NDArray[np.uint8]
 
-# Backend by MuJoCo's name and the library it needs, in the order they are tried. Both work without a display.
+# Backend by MuJoCo's name and the library it needs; the first that is here is used. Both work without a display.
 HEADLESS: Final = (("egl", "EGL"), ("osmesa", "OSMesa"))
 MAX_GEOMS: Final = 6000
 _WHAT_TO_INSTALL: Final = "on Debian and Ubuntu: apt-get install libegl1 libgl1-mesa-dri"
@@ -64,7 +64,10 @@ def _open_context(width: int, height: int) -> Any:
         context.make_current()
     except Exception as error:  # each backend raises its own errors, even AttributeError
         first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise RenderError(f"no graphics context by {name}: {first}; {_WHAT_TO_INSTALL}") from None
+        others = [other for other, _ in HEADLESS if other != name]
+        raise RenderError(
+            f"no graphics context by {name}: {first}; {_WHAT_TO_INSTALL}, or set MUJOCO_GL={others[0]}"
+        ) from None
     return context
 
 

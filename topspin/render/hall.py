@@ -18,12 +18,11 @@ from common.physics.constants import (
     TABLE_HALF_WIDTH,
     TABLE_THICKNESS,
 )
-from common.robot.description import model_path
+from common.robot.description import describe, model_path
 from common.robot.model import robot_xml
 
 Triple = tuple[float, float, float]
 BALL: Final = "ball"
-FIRST_OF_ARM: Final = "yaw"  # this body and those after it, except the ball, are the arm
 SAMPLES: Final = 4  # per pixel, for smooth edges
 SHADOW_PIXELS: Final = 2048
 
@@ -80,20 +79,20 @@ _L, _W = TABLE_HALF_LENGTH, TABLE_HALF_WIDTH
 _GANTRY_Y, _RAIL_FROM, _RAIL_TO = 1.16, -2.40, -0.55  # [m] the rails that the beam runs on
 
 
-def _box(body: str, finish: str, pos: Triple, half: Triple) -> tuple[str, str, int, Triple, Triple, None]:
+# Body, finish, shape, place and half sizes [m] in the body's frame, turn
+_Part = tuple[str, str, int, Triple, Triple, tuple[float, ...] | None]
+
+
+def _box(body: str, finish: str, pos: Triple, half: Triple) -> _Part:
     return body, finish, int(_BOX), pos, half, None
 
 
-def _disc(
-    body: str, finish: str, pos: Triple, radius: float, half: float, quat: tuple[float, ...]
-) -> tuple[str, str, int, Triple, Triple, tuple[float, ...]]:
+def _disc(body: str, finish: str, pos: Triple, radius: float, half: float, quat: tuple[float, ...]) -> _Part:
     return body, finish, int(_CYLINDER), pos, (radius, half, 0.0), quat
 
 
 _UPRIGHT: Final = (1.0, 0.0, 0.0, 0.0)
-_R, _H = 0.076, 0.0065  # [m] the racket's radius and half thickness
 
-# Body, finish, shape, place and half sizes [m] in the body's frame, turn
 HALL_PARTS: Final = (
     # table: lines, frame, legs
     _box("world", "line", (0.0, _W - _LINE, _THIN), (_L, _LINE, _THIN)),
@@ -169,13 +168,21 @@ GANTRY_PARTS: Final = (
     _disc("wrist", "accent", (0.0, 0.0, 0.060), 0.027, 0.004, _UPRIGHT),
 )
 
-RACKET_PARTS: Final = (
-    # racket: wood between two rubbers, red towards the opponent at home; handle up to the wrist
-    _disc("racket", "wood", (0.0, 0.0, 0.0), _R + 0.0015, _H - 0.0045, _ALONG),
-    _disc("racket", "red rubber", (-_H / 2 - 0.001, 0.0, 0.0), _R, _H / 2 - 0.001, _ALONG),
-    _disc("racket", "black rubber", (_H / 2 + 0.001, 0.0, 0.0), _R, _H / 2 - 0.001, _ALONG),
-    _box("racket", "wood", (0.0, 0.0, -0.085), (0.009, 0.014, 0.022)),
-)
+
+def racket_parts(body: str, radius: float, half: float) -> tuple[_Part, ...]:
+    """Return the parts of a racket: wood between two rubbers, red towards the opponent at home; handle to the wrist.
+
+    Args:
+        body: That carries it.
+        radius: [m]
+        half: Half its thickness [m].
+    """
+    return (
+        _disc(body, "wood", (0.0, 0.0, 0.0), radius + 0.0015, half - 0.0045, _ALONG),
+        _disc(body, "red rubber", (-half / 2 - 0.001, 0.0, 0.0), radius, half / 2 - 0.001, _ALONG),
+        _disc(body, "black rubber", (half / 2 + 0.001, 0.0, 0.0), radius, half / 2 - 0.001, _ALONG),
+        _box(body, "wood", (0.0, 0.0, -radius - 0.009), (0.009, 0.014, 0.022)),
+    )
 
 
 def load_hall(robot: str = "rails") -> mujoco.MjModel:
@@ -193,8 +200,10 @@ def load_hall(robot: str = "rails") -> mujoco.MjModel:
             shininess=finish.shininess,
             reflectance=finish.reflectance,
         )
+    racket = spec.geom(describe(robot).racket)
+    own_parts = racket_parts(racket.parent.name, float(racket.size[0]), float(racket.size[1]))
     for geom in spec.geoms:
-        dress = _DRESS.get(geom.name, "shell")
+        dress = None if geom.name == racket.name else _DRESS.get(geom.name, "shell")
         if dress is None:
             geom.rgba = [0.0] * 4
             geom.group = 5
@@ -205,7 +214,7 @@ def load_hall(robot: str = "rails") -> mujoco.MjModel:
     spec.geom("net").pos = [0.0, 0.0, NET_HEIGHT / 2 - 0.005]
     spec.geom("table").size = [_L, _W, TABLE_THICKNESS / 2]
     spec.geom("table").pos = [0.0, 0.0, -TABLE_THICKNESS / 2]
-    for body, of, shape, pos, size, quat in HALL_PARTS + (GANTRY_PARTS if is_gantry else ()) + RACKET_PARTS:
+    for body, of, shape, pos, size, quat in HALL_PARTS + (GANTRY_PARTS if is_gantry else ()) + own_parts:
         geom = spec.body(body).add_geom(
             type=mujoco.mjtGeom(shape),
             pos=pos,

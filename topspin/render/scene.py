@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from common.physics.constants import BALL_RADIUS, GRID_STEP
 from topspin.render.gl import Canvas, Image
-from topspin.render.hall import BALL, FIRST_OF_ARM, load_hall
+from topspin.render.hall import BALL, load_hall
 from topspin.render.replay import BallPath, Moment
 
 Array = npt.NDArray[np.float64]
@@ -90,7 +90,9 @@ class Painter:
         self._model.vis.global_.fovy = FIELD_OF_VIEW_DEG
         self._data = mujoco.MjData(self._model)
         self._ball = self._model.body(BALL).mocapid[0]
-        self._arm = self._model.body(FIRST_OF_ARM).id
+        # From the body of its first hinge on all bodies are the arm, except the ball
+        hinges = self._model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+        self._arm = int(self._model.jnt_bodyid[hinges][0]) if hinges.any() else self._model.nbody
         self._options = mujoco.MjvOption()
         self._options.sitegroup[:] = 0  # marks for sensors, not visible objects
         self._canvas = Canvas(self._model, width, height)

@@ -15,6 +15,7 @@ from typing import Final
 from common.errors import ConfigError, ReportedError
 from common.service.config import load
 from common.service.config_help import settings_of
+from common.service.config_sources import BOOLEANS
 from common.service.log import set_up_logging
 from common.service.process import DONE
 from topspin.report.config import ReportConfig
@@ -35,8 +36,9 @@ def settings(argv: Sequence[str]) -> ReportConfig:
             continue
         flags.append(word)
         setting = known.get(word.removeprefix("--").replace("-", "_"))
-        takes_value = word == "--config" or (setting is not None and not setting.is_switch)
-        if takes_value and words:
+        is_switch = setting is not None and setting.is_switch
+        takes_value = word == "--config" or (setting is not None and not is_switch)
+        if words and (takes_value or (is_switch and words[0] in BOOLEANS)):
             flags.append(words.pop(0))
     if runs:
         flags += ["--runs", json.dumps(runs)]
@@ -67,6 +69,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
     for line in found.missing:
         log.warning("missing or unequal %s", line)
     try:
+        page.write_numbers(found, out)  # first: they took hours
         page.write(found, figures.draw(found, out), out)
     except OSError as error:
         raise ReportedError(f"can't write the report to {out}: {error.strerror}") from error

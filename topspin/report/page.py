@@ -10,6 +10,7 @@ from typing import Final
 import jinja2
 
 from common.errors import ReportedError
+from common.service.whole_file import write_whole
 from topspin.report import tables
 from topspin.report.provenance import own_command
 from topspin.report.results import Results, as_json, mean_of
@@ -144,9 +145,13 @@ def as_html(parts: Sequence[Section], folder: Path, title: str = TITLE) -> str:
     return environment.get_template("page.html.j2").render(title=title, sections=parts, images=images)
 
 
+def write_numbers(found: Results, folder: Path) -> None:
+    """Write results.json, which needs no plots."""
+    write_whole(folder / "results.json", json.dumps(as_json(found), allow_nan=False, indent=1) + "\n")
+
+
 def write(found: Results, drawings: Sequence[Drawing], folder: Path) -> None:
-    """Write report.md, report.html and results.json beside the plots in ``folder``."""
+    """Write report.md and report.html beside the plots in ``folder``."""
     parts = sections(found, drawings)
     (folder / "report.md").write_text(as_markdown(parts), encoding="utf-8")
     (folder / "report.html").write_text(as_html(parts, folder), encoding="utf-8")
-    (folder / "results.json").write_text(json.dumps(as_json(found), allow_nan=False, indent=1) + "\n")

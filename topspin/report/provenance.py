@@ -5,13 +5,14 @@ import platform
 import shlex
 import subprocess
 from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
-from common.service.config_help import settings_of
+from common.service.config import load, recipe_names, to_tables
 from common.service.config_sources import flag_of
-from deploy.config import DeployConfig
+from deploy.config import RECIPES, SECTION, DeployConfig
 from topspin.report.config import ReportConfig
 from topspin.report.groups import leaves
 
@@ -20,30 +21,43 @@ ALWAYS: Final = ("rallies", "seed", "launch", "policy")
 """Settings that the command of a report has also where they are the defaults."""
 PACKAGES: Final = ("topspin", "numpy", "torch", "mujoco", "numba", "eclipse-zenoh")
 NOT_IN_COMMAND: Final = frozenset(
-    {"run", "resume", "panel", "endpoint", "metrics_port"}
-)  # they do not change a run's result
+    {"run", "recipe", "resume", "panel", "endpoint", "metrics_port"}
+)  # named apart, or without a part in a run's result
 
 
-def run_defaults() -> dict[str, Any]:
-    """Return the defaults of a run by dotted path."""
-    return {path: setting.default for path, setting in settings_of(DeployConfig).items()}
+@cache
+def run_defaults(recipe: str) -> dict[str, Any]:
+    """Return the settings of a run without other flags, by dotted path.
+
+    Args:
+        recipe: One of the package; empty: none.
+    """
+    argv = ["--recipe", recipe] if recipe else []
+    config = load(DeployConfig, argv, prog=PROGRAM, section=SECTION, environ={}, recipes=RECIPES)
+    return _by_path(to_tables(config, SECTION))
 
 
-def command(name: str, settings: Mapping[str, Any], defaults: Mapping[str, Any]) -> str:
-    """Return the command that starts such a run: its settings that aren't the defaults, as flags.
+def _by_path(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {path.removeprefix(f"{SECTION}."): value for path, value in leaves(settings)}
+
+
+def command(name: str, settings: Mapping[str, Any]) -> str:
+    """Return the command that starts such a run: what its settings are besides its recipe or the defaults, as flags.
+
+    A recipe from a file is spelled out: nobody knows whether the file is still the same.
 
     Args:
         name: The run's name.
-        settings: The run's config.toml.
-        defaults: A run's defaults by dotted path. A setting without one (of another version) is a flag too.
+        settings: The run's config.toml. A setting that there is no more is a flag too.
     """
-    if "local" not in settings:  # its services were started one by one
+    if SECTION not in settings:  # its services were started one by one
         return f"python -m services.learner --config runs/{name}/config.toml"
-    words = [PROGRAM, "--run", name]
-    for full, value in leaves(settings):
-        path = full.removeprefix("local.")
-        default = defaults.get(path)
-        if path not in NOT_IN_COMMAND and value != (list(default) if isinstance(default, tuple) else default):
+    own = _by_path(settings)
+    recipe = own.get("recipe", "") if own.get("recipe") in recipe_names(RECIPES) else ""
+    usual = run_defaults(recipe)
+    words = [PROGRAM, "--run", name, *(("--recipe", recipe) if recipe else ())]
+    for path, value in own.items():
+        if path not in NOT_IN_COMMAND and (path not in usual or value != usual[path]):
             words += [f"--{flag_of(path)}", _text(value)]
     return " ".join(words[:1] + [shlex.quote(word) for word in words[1:]])
 

@@ -20,7 +20,7 @@ from common.task.launch import RallyBlock
 from topspin.report.collect import CURVES, Curve, Run
 from topspin.report.config import ReportConfig
 from topspin.report.groups import Group, group
-from topspin.report.provenance import command, machine, run_defaults, versions
+from topspin.report.provenance import command, machine, versions
 
 log = logging.getLogger(__name__)
 
@@ -114,12 +114,16 @@ def results(runs: Sequence[Run], config: ReportConfig, on_tick: Callable[[], Non
         runs: As read from their folders.
         config: Settings.
         on_tick: Called between control steps; may raise.
+
+    Raises:
+        PolicyError: A policy can't play under the report's conditions.
     """
+    for run in runs:  # a policy that can't be measured so is refused before hours of play
+        if run.policy is not None:
+            evaluation_task(run.policy, config, config.rounds)
     rallies = evaluation_rallies(config.rallies, TaskConfig().under(config), config.seed)
-    defaults = run_defaults()
     groups = tuple(
-        _of_group(one, [_of_run(run, config, rallies, defaults, on_tick) for run in one.runs])
-        for one in group(runs)
+        _of_group(one, [_of_run(run, config, rallies, on_tick) for run in one.runs]) for one in group(runs)
     )
     missing = tuple(f"{run.name}: {what}" for run in runs for what in run.missing)
     return Results(groups, config, versions(), machine(), missing + tuple(inequalities(groups)))
@@ -129,7 +133,6 @@ def _of_run(
     run: Run,
     config: ReportConfig,
     rallies: RallyBlock,
-    defaults: Mapping[str, Any],
     on_tick: Callable[[], None],
 ) -> RunResult:
     played, went_on, found, robot = None, None, dict[str, Any](), dict[str, Any]()
@@ -148,7 +151,7 @@ def _of_run(
     return RunResult(
         run=run,
         seed=int(run.settings.get("seed", 0)),
-        command=command(run.name, run.settings, defaults),
+        command=command(run.name, run.settings),
         frames=int(trained.frames[-1]) if trained else None,
         seconds=float(trained.seconds[-1]) if trained else None,
         played=played,

@@ -259,7 +259,10 @@ def robots(found: Results) -> Table | None:
         "run", "robot", "in itself > 2 mm", "on the table > 50 N", "joint speed / limit", "racket at contact, median",
         "largest", "hits on the rim",
     )  # fmt: skip
-    note = "Shares of rallies; largest joint speed over its limit, and the joint; the rim is beyond 85 % of the radius."
+    note = (
+        "Shares of rallies, on the rim of hits; largest joint speed over its limit, and the joint; the rim is beyond "
+        "85 % of the radius."
+    )
     return Table("What it asked of the robot", columns, tuple(rows), note=note) if rows else None
 
 

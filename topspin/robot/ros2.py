@@ -29,6 +29,7 @@ from topspin.robot.controller import Array, Controller, load
 log = logging.getLogger(__name__)
 
 BALL, JOINTS, NEW_BALL, TARGETS = "ball", "joint_states", "new_ball", "joint_trajectory"
+ROS_ARGS: Final = "--ros-args"
 NOT_A_NUMBER: Final = math.nan  # a joint that is not known: the controller counts it and holds over
 
 
@@ -175,7 +176,9 @@ def main(argv: Sequence[str]) -> int:
         metavar="A,B,...",
         help="the robot's own names of the joints, in our order",
     )
-    arguments = parser.parse_args(argv)
+    words = list(argv)
+    # What follows is for ROS: rclpy reads it itself, for example new names of the topics
+    arguments = parser.parse_args(words[: words.index(ROS_ARGS)] if ROS_ARGS in words else words)
     names = [name for name in arguments.joint_names.split(",") if name]
     try:
         spin(load(arguments.folder), arguments.frame, names)

@@ -15,6 +15,7 @@ from common.robot.chain_of import chain_of
 from common.robot.description import ROBOTS, RobotError, describe, robot_names
 from common.robot.model import load_model
 from common.task.config import RobotName
+from topspin.render.hall import load_hall
 
 
 @pytest.fixture
@@ -78,6 +79,20 @@ def test_a_variant_of_a_robot_is_a_table_that_names_its_model(robots):
         ("robot.toml", 'name = "roll"', 'name = "rol"', r"joint 'rol' is not in the robot's MJCF"),
         ("robot.toml", '"wrist", "racket"]', '"wrist", "bat"]', r"geom 'bat' is not in the robot's MJCF"),
         (
+            "robot.toml",
+            "links =",
+            'racket = "bat"\nlinks =',
+            r"racket 'bat'; allowed: the name of a geom and of a",
+        ),
+        ("robot.toml", "links =", 'model = "railz"\nlinks =', r"railz.robot\.xml: No such file"),
+        ("robot.xml", "</worldbody>", "", r"robot\.xml: not readable as XML: mismatched tag"),
+        (
+            "robot.xml",
+            '<site name="racket"',
+            '<site name="other"',
+            r"racket 'racket'; allowed: the name of a geom",
+        ),
+        (
             "robot.xml",
             'axis="0 0 1" range="-3.05',
             'axis="0 1 1" range="-3.05',
@@ -100,6 +115,20 @@ def test_a_mistake_in_a_robots_files_is_one_line_that_says_what_is_allowed(robot
     with pytest.raises(RobotError, match=error) as raised:
         chain_of("wrong")
     assert "\n" not in str(raised.value)
+
+
+def test_a_new_robot_is_drawn_whatever_its_bodies_are_called(robots):
+    shutil.copytree(robots / "rails", robots / "other")
+    model = robots / "other" / "robot.xml"
+    text = model.read_text().replace('<body name="yaw"', '<body name="turn"')
+    text = text.replace('<body name="racket"', '<body name="bat"').replace('"0.076 0.0065"', '"0.09 0.0065"')
+    model.write_text(text)
+
+    drawn = load_hall("other")
+
+    red = drawn.geom_matid == drawn.material("red rubber").id
+    assert drawn.geom_size[red, 0] == pytest.approx([0.09])
+    assert [drawn.body(of).name for of in drawn.geom_bodyid[red]] == ["bat"]
 
 
 def test_a_table_with_another_number_of_joints_is_refused(robots):

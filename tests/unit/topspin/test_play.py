@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 from threading import Event
 
 import pytest
@@ -10,6 +11,7 @@ from tests.unit.evaluation.test_match import make_policy
 from topspin import evaluate, pictures, play, progress
 from topspin.pictures import PicturesConfig
 from topspin.play import PlayConfig
+from topspin.policy import load_policy
 from topspin.render import film as film_module
 from topspin.render.gl import RenderError
 from topspin.render.scene import Painter
@@ -57,7 +59,7 @@ def test_play_films_the_first_rallies(folder, tmp_path, capsys):
 
 def test_the_numbers_come_before_the_film(folder, tmp_path, capsys, monkeypatch):
     printed = []
-    monkeypatch.setattr(film_module, "check_tools", lambda: None)
+    monkeypatch.setattr(film_module, "check_tools", lambda path: None)
     monkeypatch.setattr(
         film_module, "film", lambda *given: printed.extend((capsys.readouterr().out, given[-1]))
     )
@@ -69,6 +71,31 @@ def test_the_numbers_come_before_the_film(folder, tmp_path, capsys, monkeypatch)
     assert card.title == "policy: 6 paper balls"
     assert sum(count for _, count, _ in card.bars) == 6
     assert "film of 1 rallies" in capsys.readouterr().out
+
+
+def test_a_film_that_can_not_be_written_is_refused_before_the_rallies(folder, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    video = tmp_path / "file" / "play.mp4"
+
+    with pytest.raises(RenderError, match=r"can't write .*play\.mp4: (Not a directory|File exists)"):
+        play.main(["--policy", str(folder), "--rallies", "4", "--json", "--video", str(video)], Event())
+
+    assert capsys.readouterr().out == ""
+
+
+def test_the_measures_are_printed_where_the_film_fails(folder, capsys, monkeypatch):
+    def film(*_):
+        raise RenderError("no space left")
+
+    monkeypatch.setattr(film_module, "check_tools", lambda path: None)
+    monkeypatch.setattr(film_module, "film", film)
+
+    with pytest.raises(RenderError):
+        play.main(["--policy", str(folder), "--rallies", "4", "--film-rallies", "1", "--json"], Event())
+
+    found = json.loads(capsys.readouterr().out)
+    assert found["rallies"] == 4
+    assert "video" not in found
 
 
 def test_play_stops_on_request(folder):
@@ -142,3 +169,11 @@ def test_a_match_says_how_far_it_is_where_there_is_no_terminal(monkeypatch, capl
         "played rallies=500 of=2000",
         "played rallies=2000 of=2000",
     ]
+
+
+def test_a_path_is_a_folder_even_if_the_box_has_its_name(folder, tmp_path, monkeypatch):
+    folder.rename(tmp_path / "default")
+    monkeypatch.chdir(tmp_path)
+
+    assert load_policy(Path("default")).contract.frames == load_policy("./default").contract.frames == 1
+    assert load_policy("default").contract.frames > 1_000_000

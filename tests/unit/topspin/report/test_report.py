@@ -23,7 +23,7 @@ from common.service.config import load, to_tables
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
 from common.task.observation import critic_layout, size
-from deploy.config import DeployConfig
+from deploy.config import RECIPES, DeployConfig
 from tests.unit.topspin.report.runs import make_run
 from topspin import report
 from topspin.report import command
@@ -33,7 +33,7 @@ from topspin.report.config import ReportConfig
 from topspin.report.figures import curves
 from topspin.report.groups import experiment, group
 from topspin.report.provenance import command as command_of
-from topspin.report.provenance import own_command, run_defaults
+from topspin.report.provenance import own_command
 from topspin.report.results import GroupResult, RunResult, evaluation_task, inequalities, spread
 
 OBSERVATION = TaskConfig().observation
@@ -185,6 +185,19 @@ def test_groups_are_named_by_their_differences():
     )
 
 
+@pytest.mark.parametrize(
+    ("actors", "rollouts", "frames"), [(2, 0, 2048), (64, 0, 8192), (64, 16, 2048), (64, 32, 4096)]
+)
+def test_a_minibatch_by_default_is_the_one_that_was_set(actors, rollouts, frames):
+    """64 actors have 16 environments each, and 32,768 frames a dataset."""
+
+    def settings(minibatch):
+        learner = {"ppo": {"minibatch": minibatch}, "intake": {"dataset_rollouts": rollouts}}
+        return {"actors": actors, "actor": {"horizon": 32}, "learner": learner}
+
+    assert experiment(settings(0)) == experiment(settings(frames))
+
+
 def test_experiments_of_one_name_are_distinguished_by_the_settings_that_differ():
     runs = [
         make_run(name, learner={"ppo": {"clip": clip, "gamma": 0.99}})
@@ -198,14 +211,7 @@ def test_experiments_of_one_name_are_distinguished_by_the_settings_that_differ()
 
 
 def test_a_command_is_the_settings_that_are_not_the_defaults():
-    defaults = {
-        "actors": 2,
-        "seed": 0,
-        "task.randomization": "standard",
-        "learner.ppo.clip": 0.2,
-        "network.units": (8, 4),
-        "evaluate": True,
-    }
+    units = list(NetworkConfig().units)
     settings = {
         "run": "a b",
         "actors": 4,
@@ -214,10 +220,10 @@ def test_a_command_is_the_settings_that_are_not_the_defaults():
         "local": {"panel": "off", "evaluate": False},
         "task": {"randomization": "standard"},
         "learner": {"ppo": {"clip": 0.1}},
-        "network": {"units": [8, 4]},
+        "network": {"units": units},
     }
 
-    assert command_of("a b", settings, defaults) == (
+    assert command_of("a b", settings) == (
         "topspin train --run 'a b' --actors 4 --evaluate false --learner.ppo.clip 0.1"
     )
 
@@ -226,11 +232,27 @@ def test_a_command_gives_the_settings_it_was_made_from():
     argv = "--run n --actors 3 --task.observation.history 8 --network.units 64,32 --learner.curriculum.first-stage 3"
     config = load(DeployConfig, argv.split(), prog="p", section="local", environ={})
 
-    found = command_of("n", to_tables(config, "local"), run_defaults())
+    found = command_of("n", to_tables(config, "local"))
 
     again = load(DeployConfig, found.split()[2:], prog="p", section="local", environ={})
     assert again == config
     assert sorted(found.split()[2:]) == sorted(argv.split())
+
+
+def test_a_command_with_a_recipe_keeps_what_was_set_back_to_the_defaults(tmp_path):
+    argv = "--run n --recipe paper --task.control-rate-hz 50 --task.reward.landing-bonus 100.0"
+    (tmp_path / "own.toml").write_text("[learner.ppo]\nclip = 0.1\n")
+
+    def settings_of(words):
+        return load(DeployConfig, words, prog="p", section="local", environ={}, recipes=RECIPES)
+
+    config = settings_of(argv.split())
+    found = command_of("n", to_tables(config, "local"))
+    of_file = command_of("n", to_tables(settings_of(["--recipe", str(tmp_path / "own.toml")]), "local"))
+
+    assert settings_of(found.split()[2:]) == config
+    assert sorted(found.split()[2:]) == sorted(argv.split())
+    assert of_file == "topspin train --run n --learner.ppo.clip 0.1"
 
 
 # ---- the command line
@@ -240,6 +262,13 @@ def test_words_that_are_neither_flags_nor_their_values_are_runs():
     config = settings(["a", "--rallies", "5", "b", "--rounds-too", "c", "--out", "o"])
 
     assert (config.runs, config.rallies, config.rounds_too, config.out) == (("a", "b", "c"), 5, True, "o")
+
+
+@pytest.mark.parametrize("word", ["true", "false"])
+def test_a_switch_may_have_its_value_behind_it(word):
+    config = settings(["a", "--rounds-too", word, "b"])
+
+    assert (config.runs, config.rounds_too) == (("a", "b"), word == "true")
 
 
 def test_no_run_and_unknown_flags_are_errors_and_help_is_real():

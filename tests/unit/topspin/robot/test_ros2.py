@@ -14,7 +14,7 @@ from topspin.robot.controller import MAX_HELD, Controller
 from topspin.robot.faults import Fault
 from topspin.robot.made_up_ball import detections
 from topspin.robot.network import Network
-from topspin.robot.ros2 import Messages, RobotNode, spin
+from topspin.robot.ros2 import Messages, RobotNode, main, spin
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES = {
@@ -214,3 +214,9 @@ def test_a_signal_ends_the_node_without_a_traceback(controller, monkeypatch, end
     spin(controller, "table", [])
 
     assert closed == ["node", "context"]
+
+
+def test_words_for_ros_are_left_to_ros(tmp_path, capsys):
+    assert main([str(tmp_path / "nowhere"), "--ros-args", "-r", "ball:=/camera/ball"]) == 1
+
+    assert "nowhere" in capsys.readouterr().err  # and no unknown argument
