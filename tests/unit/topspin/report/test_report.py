@@ -15,18 +15,19 @@ import tomli_w
 
 from common.errors import ConfigError, HelpRequest, ReportedError
 from common.policy.config import NetworkConfig
-from common.policy.contract import contract_of
+from common.policy.contract import PolicyError, contract_of
 from common.policy.folder import load_policy, mean_policy, save_policy
 from common.policy.normalizer import Moments
 from common.policy.weights import new_network
 from common.service.config import load, to_tables
 from common.task.config import TaskConfig
 from common.task.experience import ExperienceConfig
-from common.task.observation import critic_layout, size
+from common.task.observation import PAPER_OBSERVATION, critic_layout, size
 from deploy.config import RECIPES, DeployConfig
 from tests.unit.topspin.report.runs import make_run
 from topspin import report
 from topspin.report import command
+from topspin.report import results as results_module
 from topspin.report.collect import CURVES, Curve, RunError, TrainingCurve, read
 from topspin.report.command import make_folder, settings
 from topspin.report.config import ReportConfig
@@ -287,6 +288,23 @@ def test_without_its_libraries_a_report_names_the_extra(monkeypatch, tmp_path):
 
     with pytest.raises(ReportedError, match=r"pip install -e '\.\[report\]'"):
         command.main([str(write_run(tmp_path, "a"))], Event())
+
+
+def test_a_policy_that_can_not_be_measured_so_is_refused_before_any_rally(tmp_path, monkeypatch):
+    """An expected spin has no effect on a policy that observes neither spin nor prediction."""
+    played = []
+    monkeypatch.setattr(results_module, "play_match", lambda *arguments: played.append(arguments))
+    runs = [read(str(write_run(tmp_path, name))) for name in "ab"]
+    contract = runs[1].policy.contract
+    blind = contract.task.model_copy(update={"observation": PAPER_OBSERVATION})
+    policy = replace(runs[1].policy, contract=contract.model_copy(update={"task": blind}))
+
+    with pytest.raises(PolicyError, match="expected"):
+        results_module.results(
+            [runs[0], replace(runs[1], policy=policy)], ReportConfig(expected_spin="strong")
+        )
+
+    assert played == []
 
 
 def test_policies_are_measured_on_the_reports_task_not_their_training_task(tmp_path):
