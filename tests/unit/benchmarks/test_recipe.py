@@ -202,5 +202,12 @@ def test_the_repositorys_runs_of_the_recipes_are_what_their_names_say():
     for folder in kept:
         rate, seed = folder.name.removeprefix("recipe-").split("-")
         run = tomllib.loads((folder / "config.toml").read_text(encoding="utf-8"))
-        assert label(run, known) == {"50hz": "paper-50hz", "200hz": "paper"}[rate]
-        assert (run["seed"], run["frames"]) == (int(seed), 60_000_000)
+        if rate == "quarter":  # of the learning rate, and of the frames
+            own = run["learner"]["ppo"]
+            assert (own.pop("learning_rate"), own.pop("learning_rate_min")) == (1.25e-4, 1.25e-5)
+            own |= {"learning_rate": 5e-4, "learning_rate_min": 5e-5}
+            assert (label(run, known), run["frames"]) == ("paper-50hz", 15_000_000)
+        else:
+            assert label(run, known) == {"50hz": "paper-50hz", "200hz": "paper"}[rate]
+            assert run["frames"] == 60_000_000
+        assert run["seed"] == int(seed)
