@@ -3,11 +3,11 @@
     python -m benchmarks.batch_sizes --sizes 8192,32768,131072 --seeds 0,1 --json
 
 Each training is one of ``benchmarks.time_to_quality``: a passage counts only if other balls confirm it. Two actors
-(four for the largest) play as many environments as a dataset needs, and a minibatch is a quarter of it. So the frames
-are those of a hundred actors, and the minutes are not. Trainings are written to ``results/large_batches.json``, from
-which ``benchmarks.scaling`` fits its law. What is in the file is not trained again, unless it missed the goal with
-fewer ``--frames``. ``--minibatch`` and ``--more`` try other rules, and need a file of their own (``--out``), since
-``benchmarks.scaling`` counts the steps of the first one.
+(four for the largest) play as many environments as a dataset needs, and a minibatch is the learner's own
+(``minibatch_of``). So the frames are those of a hundred actors, and the minutes are not. Trainings are written to
+``results/large_batches.json``, from which ``benchmarks.scaling`` fits its law. What is in the file is not trained
+again, unless it missed the goal with fewer ``--frames``. ``--minibatch`` and ``--more`` try other rules, and need a
+file of their own (``--out``), since ``benchmarks.scaling`` counts the steps of the first one.
 """
 
 import json
@@ -28,10 +28,10 @@ from benchmarks.time_to_quality import RETURN_RATE, TARGET_ERROR, TimeToQualityC
 from common.errors import ReportedError
 from common.service.process import DONE
 from common.service.whole_file import write_whole
+from services.learner.config import minibatch_of
 
 HORIZON: Final = 32  # control steps of a rollout
 FEWEST_ACTORS: Final = 2
-MINIBATCHES: Final = 4  # of a dataset, as the law assumes
 TRAINING: Final = attrgetter("dataset", "minibatch", "more", "seed")  # what makes a point another one
 LARGEST_ROLLOUT: Final = 131_072  # frames: 26 MB, and a message may have 64 MiB
 
@@ -59,7 +59,7 @@ class BatchSizesConfig(BenchmarkConfig):
     minibatch: int = Field(
         0,
         ge=0,
-        description="of each training; 0: a quarter of its dataset",
+        description="of each training; 0: as the learner has by default",
         json_schema_extra={"unit": "frames"},
     )
     more: str = Field("", description="more flags of deploy.local")
@@ -88,14 +88,14 @@ def flags_of(size: int, minibatch: int) -> list[str]:
     return as_flags(flags)
 
 
-def minibatch_of(config: BatchSizesConfig, size: int) -> int:
+def step_frames(config: BatchSizesConfig, size: int) -> int:
     """Return the frames of a minibatch with datasets of so many frames."""
-    return config.minibatch or size // MINIBATCHES
+    return config.minibatch or minibatch_of(size)
 
 
 def answers(point: Point, config: BatchSizesConfig) -> bool:
     """Return whether a training is one of those that are wanted now."""
-    is_same = (point.minibatch, point.more) == (minibatch_of(config, point.dataset), config.more)
+    is_same = (point.minibatch, point.more) == (step_frames(config, point.dataset), config.more)
     return is_same and (point.frames is not None or point.limit >= config.frames)
 
 
@@ -118,15 +118,15 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
     for size, seed in missing(config, points) if config.train else ():
         if stop.is_set():
             break
-        minibatch = minibatch_of(config, size)
-        flags = [*flags_of(size, minibatch), "--frames", str(config.frames), *shlex.split(config.more)]
+        frames = step_frames(config, size)
+        flags = [*flags_of(size, frames), "--frames", str(config.frames), *shlex.split(config.more)]
         settings = TimeToQualityConfig(minutes=1e6, more=shlex.join(flags))
         found = train(settings, f"{base}-{size}-{seed}", seed, stop, resumes=True)
         if found is None:
             break  # it was stopped, and says nothing
         point = Point(
             dataset=size,
-            minibatch=minibatch,
+            minibatch=frames,
             frames=found["frames"] if found["reached"] else None,
             limit=config.frames,
             seed=seed,

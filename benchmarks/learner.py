@@ -36,7 +36,7 @@ def bare_products(
     network: ActorCritic, frames: int, ppo: PPOConfig, compute: Compute
 ) -> tuple[Callable[[], None], float]:
     """Return a function that computes an epoch's products, and how many floating-point operations they are."""
-    dtype, rows = DTYPES[compute.precision], min(ppo.minibatch, frames)
+    dtype, rows = DTYPES[compute.precision], min(ppo.minibatch_of(frames), frames)
     batches = frames // rows
     layers, operations = [], 0.0
     for name, linear in network.named_modules():
@@ -113,7 +113,7 @@ def measure(
         "precision": compute.precision,
         "threads": torch.get_num_threads(),
         "frames": frames,
-        "minibatch": ppo.minibatch,
+        "minibatch": ppo.minibatch_of(frames),
         "mini_epochs": ppo.mini_epochs,
         **({"busy_share": round(busy_share(epoch), 4)} if compute.device.type == "cuda" else {}),
     }

@@ -29,7 +29,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from benchmarks.play import make_player, make_training
+from benchmarks.play import HORIZON, make_player, make_training
 from benchmarks.settings import TimedConfig, run
 from common.comms.codec import decode, encode
 from common.comms.messages import Rollout
@@ -119,8 +119,9 @@ def measure(
     ranks: int, envs: int, seconds: float, turns: int, seed: int, links: Links
 ) -> dict[str, float | int | str]:
     """Return the figures of a group of ``ranks``."""
-    own = PPOConfig()  # of a learner that trains a rank's part alone
-    ppo = PPOConfig(minibatch=ranks * own.minibatch)
+    part = PPOConfig().minibatch_of(HORIZON * envs)
+    own = PPOConfig(minibatch=part)  # of a learner that trains a rank's part alone
+    ppo = PPOConfig(minibatch=ranks * part)
     player = make_player(make_training(ppo, seed), envs, seed)
     payloads = [encode(player.play("benchmark", 1, sequence)) for sequence in range(ranks)]
 
@@ -152,7 +153,7 @@ def measure(
         "parameters_difference": difference(ppo.clip),
         "parameters_difference_wide_clip": difference(WIDE),
         "epochs_compared": EPOCHS_COMPARED,
-        "frames": 32 * envs * ranks,
+        "frames": HORIZON * envs * ranks,
         "minibatch": ppo.minibatch,
         "precision": compute_of(ppo).precision,
     }

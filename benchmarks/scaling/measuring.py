@@ -163,13 +163,14 @@ def _learner(training: Training, few: Rollout, many: Rollout, seconds: float, se
         opening.append((frames, cpu_of(opened, seconds / 4)))
         reading.append((frames, cpu_of(partial(training.read, [rollout] * pieces), seconds / 2) / pieces))
     ppo, frames = training.ppo, many.rewards.size
+    own_size = ppo.minibatch_of(frames)
     steps = []
-    for minibatch in (SMALL_MINIBATCH, ppo.minibatch):
+    for minibatch in (SMALL_MINIBATCH, own_size):
         own = make_training(ppo.model_copy(update={"minibatch": minibatch}), seed)
         epoch_s = cpu_of(partial(own.run_epoch, [many]), seconds)
         update_s = epoch_s - cpu_of(partial(own.read, [many]), seconds / 2)
         steps.append((minibatch, update_s * minibatch / (ppo.mini_epochs * frames)))
-    echo = make_training(ppo.model_copy(update={"minibatch": ECHOES * ppo.minibatch}), seed, Echo(0, ECHOES))
+    echo = make_training(ppo.model_copy(update={"minibatch": ECHOES * own_size}), seed, Echo(0, ECHOES))
     whole_s = cpu_of(partial(echo.run_epoch, [many]), seconds) - epoch_s
     return {
         "opening": Line.through(*opening),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from benchmarks.scaling.costs import HORIZON, Costs
 from common.errors import ReportedError
-from services.learner.config import PPOConfig
+from services.learner.config import PPOConfig, minibatch_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +15,7 @@ class Plan:
     actors: int
     learners: int = 1  # ranks of the group
     envs: int = 256  # environments of each actor
-    minibatch: int = PPOConfig().minibatch  # frames, over all ranks
+    minibatch: int = 0  # frames, over all ranks; 0: as the learner has by default
     evaluates: bool = True
     learner_frames_per_s: float = (
         0.0  # of one learner on an accelerator, from memory; 0: learners are on the cores
@@ -35,8 +35,9 @@ class Plan:
     @property
     def steps(self) -> int:
         """Gradient steps of a pass; a small remainder makes none (`ppo.minibatches`)."""
-        whole, rest = divmod(self.dataset, self.minibatch)
-        return whole + (rest >= max(1, min(self.minibatch, self.dataset) // 2))
+        size = self.minibatch or minibatch_of(self.dataset)
+        whole, rest = divmod(self.dataset, size)
+        return whole + (rest >= max(1, min(size, self.dataset) // 2))
 
 
 def available_cores(plan: Plan, costs: Costs) -> float:

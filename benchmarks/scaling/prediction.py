@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
-from benchmarks.scaling.costs import HORIZON, Costs, Line, Network, gather_s, sum_s
+from benchmarks.scaling.costs import Costs, Line, Network, gather_s, sum_s
 from benchmarks.scaling.large_batches import FramesToGoal
 from benchmarks.scaling.plan import Plan, available_cores
 from benchmarks.scaling.simulate import SMALL_EXCHANGES, VALUE_BYTES, Result, simulate
@@ -19,7 +19,6 @@ SIZES: Final = (4, 8, 16, 32, 64, 128, 256)  # environments of an actor, where t
 FEWEST, MOST = 6, 40  # splits that are simulated shortly: those that the estimate puts first
 EVENTS_OF_SEARCH: Final = 4000  # cores times these splits: a large fleet takes a second each
 FINALISTS: Final = 4  # splits that are simulated for longer: the best of those
-STEPS: Final = 4  # gradient steps of a pass, as the default has: a minibatch is a quarter of a dataset
 SHORT, LONG = (3, 4), (8, 24)  # datasets of a simulation: before its measurement, and in it
 EVENTS_OF_RUN: Final = 6000  # datasets of a large fleet are many events each, and are all alike
 TWICE: Final = 2.0
@@ -142,7 +141,6 @@ def candidates(cores: int, setting: Setting) -> Iterator[Plan]:
                     actors=actors,
                     learners=ranks,
                     envs=envs,
-                    minibatch=max(1, actors * envs * HORIZON // STEPS),
                     learner_frames_per_s=setting.learner_frames_per_s,
                     passes=PPOConfig().mini_epochs,
                 )

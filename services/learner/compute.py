@@ -62,5 +62,5 @@ def new_engine(network: ActorCritic, ppo: PPOConfig, compute: Compute) -> Engine
     """Return the engine of a network, with a new optimiser."""
     make_optimizer = partial(torch.optim.Adam, lr=ppo.learning_rate, eps=1e-8, fused=True)
     if compute.device.type == "cpu":
-        return CpuEngine(network, make_optimizer, ppo.minibatch, compute.precision)
+        return CpuEngine(network, make_optimizer, ppo.largest_minibatch, compute.precision)
     return DeviceEngine(network, make_optimizer, compute.device, compute.precision)

@@ -1,7 +1,7 @@
 """Settings of the learner."""
 
 import math
-from typing import ClassVar, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -12,8 +12,17 @@ from common.task.experience import ExperienceConfig
 from services.learner.budget import BudgetConfig
 
 LAST_STAGE = 3
+# Of a quarter of a dataset (ADR-0069)
+SMALLEST_MINIBATCH: Final = 2048
+LARGEST_MINIBATCH: Final = 8192
+FEWEST_FRAMES: Final = 32  # of a minibatch that is set
 EvaluatedWeights = Literal["mean", "newest"]
 Device = Literal["auto", "cpu", "cuda"]
+
+
+def minibatch_of(dataset: int) -> int:
+    """Return the frames of a minibatch of a dataset with so many frames, where none are set (ADR-0069)."""
+    return min(max(dataset // 4, SMALLEST_MINIBATCH), LARGEST_MINIBATCH)
 
 
 class PPOConfig(BaseModel):
@@ -26,7 +35,11 @@ class PPOConfig(BaseModel):
     clip: float = Field(0.2, gt=0, lt=1, description="trust region of the probability ratio")
     mini_epochs: int = Field(4, ge=1, le=32, description="passes over a dataset")
     minibatch: int = Field(
-        2048, ge=32, description="samples a gradient step", json_schema_extra={"unit": "frames"}
+        0,
+        ge=0,
+        description="of a gradient step, over all ranks; 0: a quarter of the dataset, from "
+        f"{SMALLEST_MINIBATCH} to {LARGEST_MINIBATCH}",
+        json_schema_extra={"unit": "frames"},
     )
     reward_scale: float = Field(0.1, gt=0, description="rewards are multiplied by this before anything else")
     value_weight: float = Field(1.0, ge=0, description="weight of the value loss (half the mean square)")
@@ -76,6 +89,21 @@ class PPOConfig(BaseModel):
     refit_variance: float = Field(
         0.6, ge=0, le=1, description="explained variance at which the policy learns again before that"
     )
+
+    @property
+    def largest_minibatch(self) -> int:
+        """Frames of a minibatch at most, whatever the dataset."""
+        return self.minibatch or LARGEST_MINIBATCH
+
+    def minibatch_of(self, dataset: int) -> int:
+        """Return the frames of a minibatch of a dataset with so many frames."""
+        return self.minibatch or minibatch_of(dataset)
+
+    @model_validator(mode="after")
+    def _a_minibatch_is_no_handful(self) -> Self:
+        if 0 < self.minibatch < FEWEST_FRAMES:
+            raise ValueError(f"minibatch {self.minibatch}; allowed: 0, or {FEWEST_FRAMES} and more")
+        return self
 
     @model_validator(mode="after")
     def _bounds_are_in_order(self) -> Self:  # the starting rate is clipped to them when it adapts

@@ -116,6 +116,7 @@ def update(
         share: Which frames of the group's dataset ``data`` are; None: all of them.
     """
     share = share or whole(data)
+    size = config.minibatch_of(share.frames)
     data = engine.begin(data, _plan(config, mode, share))
     learning_rate = rate.start
     passes = []  # sums of each
@@ -124,7 +125,7 @@ def update(
         for settings in engine.optimizer.param_groups:
             settings["lr"] = learning_rate
         rows = []
-        for batch, count in minibatches(data, config.minibatch, generator, share):
+        for batch, count in minibatches(data, size, generator, share):
             rows.append(engine.step(batch, count))
             on_tick()
         sums = engine.sums(rows)

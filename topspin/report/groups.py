@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from services.actor.config import env_count
-from services.learner.config import LAST_STAGE
+from services.learner.config import LAST_STAGE, minibatch_of
 from topspin.report.collect import Run
 
 BOOKKEEPING: Final = frozenset(
@@ -49,15 +49,23 @@ def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a run that define the experiment, by dotted path.
 
     Of actors and their environments it is the product that counts: 2 actors of 128 make the datasets of one of 256.
+    A minibatch is that of these datasets.
     """
     found = {
         path: value
         for path, value in leaves(settings)
         if path.split(".")[0] != EVALUATOR and not BOOKKEEPING & {path, path.split(".")[-1]}
     }
-    if "actors" in found and not found.get("learner.intake.dataset_rollouts"):
-        actors = found.pop("actors")
-        found["environments"] = actors * env_count(found.pop("actor.envs", 0), actors)
+    if "actors" in found:
+        actors, rollouts = found["actors"], found.get("learner.intake.dataset_rollouts")
+        envs = env_count(found.get("actor.envs", 0), actors)
+        if not rollouts:
+            del found["actors"]
+            found.pop("actor.envs", None)
+            found["environments"] = actors * envs
+        if found.get("learner.ppo.minibatch") == 0:
+            dataset = (rollouts or actors) * envs * found["actor.horizon"]
+            found["learner.ppo.minibatch"] = minibatch_of(dataset)
     return found
 
 

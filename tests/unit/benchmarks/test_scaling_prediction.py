@@ -107,12 +107,15 @@ def test_without_measured_trainings_actors_have_the_environments_that_the_progra
 
 
 @pytest.mark.parametrize("law", [None, LAW])
-def test_every_split_has_an_actor_for_each_learner_and_a_quarter_of_a_dataset_as_minibatch(law):
+def test_every_split_has_an_actor_for_each_learner_and_the_learners_own_minibatches(law):
     plans = list(candidates(32, replace(SETTING, law=law)))
 
     assert {plan.learners for plan in plans} == {1, 2, 3, 4, 6, 8, 12, 16}
     assert all(plan.actors >= plan.learners for plan in plans)
-    assert all(plan.steps == 4 for plan in plans)
+    # A quarter of a dataset, from 2,048 to 8,192 frames
+    for plan in plans:
+        size = min(max(plan.dataset // 4, 2048), 8192)
+        assert abs(plan.steps - plan.dataset / size) <= 0.5 or plan.steps == 1
     assert all(plan.actors + plan.learners <= 32 for plan in plans)
 
 
@@ -190,7 +193,7 @@ def test_with_measured_trainings_there_are_minutes(costs_file, tmp_path, capsys)
     points = [
         {
             "dataset": d,
-            "minibatch": d // 4,
+            "minibatch": 2048,
             "frames": round(8e6 * (1 + d / 60_000)),
             "limit": 10**9,
             "seed": 0,

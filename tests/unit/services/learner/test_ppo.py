@@ -17,7 +17,7 @@ from services.learner.ppo import update as update_by
 
 def update(network, optimizer, data, config, *arguments, **named):
     """Update with an optimiser of the network's parameters, which keeps its moments from call to call."""
-    engine = CpuEngine(network, lambda _: optimizer, config.minibatch, compute_of(config).precision)
+    engine = CpuEngine(network, lambda _: optimizer, config.largest_minibatch, compute_of(config).precision)
     return update_by(engine, data, config, *arguments, **named)
 
 
@@ -229,6 +229,25 @@ def test_a_distilled_policy_learns_the_teachers_actions_and_nothing_from_rewards
     assert stats.learning_rate == 2e-3  # no trust region changes it
     assert last.correction_loss < 0.01 * stats.correction_loss
     assert last.value_loss < stats.value_loss
+
+
+def test_a_larger_dataset_has_larger_minibatches_by_default():
+    """Three passes over 16,384 frames are twelve steps of 4,096, and their engine is made for any dataset."""
+    network = new_network(NetworkConfig(units=(8,)))
+    config = PPOConfig(mini_epochs=3)
+    engine = CpuEngine(network, torch.optim.Adam, config.largest_minibatch, "float32")
+    ticks = []
+
+    update_by(
+        engine,
+        make_data(network, 16_384),
+        config,
+        LearningRate(1e-4, 1e-3),
+        torch.Generator().manual_seed(0),
+        on_tick=lambda: ticks.append(1),
+    )
+
+    assert len(ticks) == 12
 
 
 def test_critic_only_applies_no_correction():

@@ -65,3 +65,19 @@ def test_new_flags_are_checked_together_with_recorded_settings_not_defaults(valu
 
 def test_a_run_without_recorded_settings_is_resumed_with_the_given_ones():
     assert settings(["--run", "r", "--resume", "--seed", "3"]) == LearnerConfig(run="r", resume=True, seed=3)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "frames"),
+    [(32, 2048), (8192, 2048), (16_384, 4096), (32_768, 8192), (131_072, 8192), (10**7, 8192)],
+)
+def test_a_minibatch_is_a_quarter_of_the_dataset_within_bounds(dataset, frames):
+    assert PPOConfig().minibatch_of(dataset) == frames
+    assert PPOConfig().largest_minibatch == 8192
+    assert PPOConfig(minibatch=512).minibatch_of(dataset) == PPOConfig(minibatch=512).largest_minibatch == 512
+
+
+@pytest.mark.parametrize("frames", [1, 31])
+def test_a_minibatch_of_a_few_frames_is_refused(frames):
+    with pytest.raises(ValueError, match=f"minibatch {frames}; allowed: 0, or 32 and more"):
+        PPOConfig(minibatch=frames)
