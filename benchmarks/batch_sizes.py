@@ -88,14 +88,9 @@ def flags_of(size: int, minibatch: int) -> list[str]:
     return as_flags(flags)
 
 
-def step_frames(config: BatchSizesConfig, size: int) -> int:
-    """Return the frames of a minibatch with datasets of so many frames."""
-    return config.minibatch or minibatch_of(size)
-
-
 def answers(point: Point, config: BatchSizesConfig) -> bool:
     """Return whether a training is one of those that are wanted now."""
-    is_same = (point.minibatch, point.more) == (step_frames(config, point.dataset), config.more)
+    is_same = (point.minibatch, point.more) == (minibatch_of(config.minibatch, point.dataset), config.more)
     return is_same and (point.frames is not None or point.limit >= config.frames)
 
 
@@ -118,15 +113,15 @@ def main(config: BatchSizesConfig, stop: Event) -> int:
     for size, seed in missing(config, points) if config.train else ():
         if stop.is_set():
             break
-        frames = step_frames(config, size)
-        flags = [*flags_of(size, frames), "--frames", str(config.frames), *shlex.split(config.more)]
+        minibatch = minibatch_of(config.minibatch, size)
+        flags = [*flags_of(size, minibatch), "--frames", str(config.frames), *shlex.split(config.more)]
         settings = TimeToQualityConfig(minutes=1e6, more=shlex.join(flags))
         found = train(settings, f"{base}-{size}-{seed}", seed, stop, resumes=True)
         if found is None:
             break  # it was stopped, and says nothing
         point = Point(
             dataset=size,
-            minibatch=frames,
+            minibatch=minibatch,
             frames=found["frames"] if found["reached"] else None,
             limit=config.frames,
             seed=seed,

@@ -82,9 +82,8 @@ def main(argv: Sequence[str], stop: Event) -> int:
             film(Path(config.video), records, config, note, on_tick, score_card(found, config.policy))
         except ReportedError:
             if config.json_line:  # the measures are there, if no film is
-                print_measures(
-                    {name: value for name, value in found.items() if name != "video"}, as_json=True
-                )
+                del found["video"]
+                print_measures(found, as_json=True)
             raise
     found["seconds"] = round(time.monotonic() - started, 2)
     if config.json_line or not config.film_rallies:

@@ -35,7 +35,7 @@ class Plan:
     @property
     def steps(self) -> int:
         """Gradient steps of a pass; a small remainder makes none (`ppo.minibatches`)."""
-        size = self.minibatch or minibatch_of(self.dataset)
+        size = minibatch_of(self.minibatch, self.dataset)
         whole, rest = divmod(self.dataset, size)
         return whole + (rest >= max(1, min(size, self.dataset) // 2))
 

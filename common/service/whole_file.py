@@ -3,6 +3,7 @@
 import os
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 
 
 def write_whole(file: Path, content: str | bytes) -> None:
@@ -23,6 +24,13 @@ def write_whole(file: Path, content: str | bytes) -> None:
             part.unlink()
         raise
     sync_folder(file.parent)
+
+
+def make_writable(folder: Path) -> None:
+    """Make a folder unless it is there. Raises OSError if no file can be written in it: ask before hours of work."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryFile(dir=folder):
+        pass
 
 
 def sync_folder(folder: Path) -> None:

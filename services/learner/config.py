@@ -20,9 +20,9 @@ EvaluatedWeights = Literal["mean", "newest"]
 Device = Literal["auto", "cpu", "cuda"]
 
 
-def minibatch_of(dataset: int) -> int:
-    """Return the frames of a minibatch of a dataset with so many frames, where none are set (ADR-0069)."""
-    return min(max(dataset // 4, SMALLEST_MINIBATCH), LARGEST_MINIBATCH)
+def minibatch_of(minibatch: int, dataset: int) -> int:
+    """Return the frames of a minibatch of a dataset with so many, by the setting ``minibatch`` (ADR-0069)."""
+    return minibatch or min(max(dataset // 4, SMALLEST_MINIBATCH), LARGEST_MINIBATCH)
 
 
 class PPOConfig(BaseModel):
@@ -97,7 +97,7 @@ class PPOConfig(BaseModel):
 
     def minibatch_of(self, dataset: int) -> int:
         """Return the frames of a minibatch of a dataset with so many frames."""
-        return self.minibatch or minibatch_of(dataset)
+        return minibatch_of(self.minibatch, dataset)
 
     @model_validator(mode="after")
     def _a_minibatch_is_no_handful(self) -> Self:

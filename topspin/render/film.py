@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, Final
 
 import numpy as np
 
 from common.evaluation.rally_recorder import RecordedRally
+from common.service.whole_file import make_writable
 from common.task.states import Outcome
 from topspin.progress import bar
 from topspin.render.config import FilmConfig
@@ -50,9 +50,7 @@ class FilmOptions:
 def check_tools(path: Path) -> None:
     """Raise RenderError if no film can be made here, or none at ``path``; called before the rallies are played."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=path.parent):
-            pass
+        make_writable(path.parent)
     except OSError as error:
         raise RenderError(f"can't write {path}: {error.strerror}") from None
     for module in ("imageio_ffmpeg", "PIL.Image"):

@@ -7,7 +7,6 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryFile
 from threading import Event
 from types import ModuleType
 from typing import Final
@@ -18,6 +17,7 @@ from common.service.config_help import settings_of
 from common.service.config_sources import BOOLEANS
 from common.service.log import set_up_logging
 from common.service.process import DONE
+from common.service.whole_file import make_writable
 from topspin.report.config import ReportConfig
 
 log = logging.getLogger(__name__)
@@ -80,9 +80,7 @@ def main(argv: Sequence[str], stop: Event) -> int:
 def make_folder(out: Path) -> None:
     """Make the folder of a report, before hours of play. Raises ConfigError if nothing can be written there."""
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=out):
-            pass
+        make_writable(out)
     except OSError as error:
         raise ConfigError(
             f"out = {str(out)!r}: {error.strerror}; allowed: a folder that can be written"

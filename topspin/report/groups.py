@@ -63,9 +63,9 @@ def experiment(settings: Mapping[str, Any]) -> dict[str, Any]:
             del found["actors"]
             found.pop("actor.envs", None)
             found["environments"] = actors * envs
-        if found.get("learner.ppo.minibatch") == 0:
+        if "learner.ppo.minibatch" in found:
             dataset = (rollouts or actors) * envs * found["actor.horizon"]
-            found["learner.ppo.minibatch"] = minibatch_of(dataset)
+            found["learner.ppo.minibatch"] = minibatch_of(found["learner.ppo.minibatch"], dataset)
     return found
 
 
